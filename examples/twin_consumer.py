@@ -5,35 +5,21 @@ Prints each picture that a server reconstructs, the newest of each camera first.
 
 import sys
 
-import grpc
-
-from rfcore.image import I420
-from rfcore.native.yuv import rgb_from_i420
-from rfcore.wire.conventions import CONSUMER_OPTIONS
-from rfcore.wire.twin import (
-    Departure,
-    PictureEncoding,
-    Subscription,
-    subscription_to_wire,
-    twin_message_from_wire,
-)
-from rfcore.wire.v1 import twin_pb2_grpc
+from rfcore.wire.twin import Departure, PictureEncoding, Subscription
+from rfcore.wire.twin_client import TwinClient
 
 
 def main(address):
     """Print until the server ends the stream."""
-    asked = subscription_to_wire(Subscription(encoding=PictureEncoding.I420))
-    with grpc.insecure_channel(address, options=CONSUMER_OPTIONS) as channel:
-        for response in twin_pb2_grpc.TwinServiceStub(channel).Watch(asked):
-            message = twin_message_from_wire(response)
+    with TwinClient(address) as twin:
+        for message in twin.watch(Subscription(encoding=PictureEncoding.I420)):
+            who = f"{message.vehicle_id}/{message.camera_id}"
             if isinstance(message, Departure):
-                print(f"{message.vehicle_id}/{message.camera_id} left", flush=True)
+                print(f"{who} left", flush=True)
                 continue
-            size_px = (message.intrinsics.width_px, message.intrinsics.height_px)
-            rgb = rgb_from_i420(I420.unpacked(size_px, message.picture))  # uint8 [H, W, 3]
             where = "lost" if message.pose is None else message.pose.translation_m
-            who = f"{message.vehicle_id}/{message.camera_id} {message.sequence}"
-            print(f"{who}: at {where}, mean level {rgb.mean():.0f}", flush=True)
+            level = message.rgb.mean()  # of uint8 [H, W, 3]
+            print(f"{who} {message.sequence}: at {where}, mean level {level:.0f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""A consumer of the twin: prints a line per picture, and keeps pictures in folders or as a video.
+"""``rfedge watch``: prints a line per picture, and keeps pictures in folders or as a video.
 
-One thread receives and keeps pictures, one after the other: when the disk is slow this consumer
-misses pictures, and says how many. The main thread only waits for signals: ``watch_until_stopped``.
-A signal must not raise an exception wherever the receiving thread happens to be: in gRPC's Python
+One thread receives and keeps pictures, one after the other: where the disk is slow it misses
+pictures, and says how many. The main thread only waits for signals: ``watch_until_stopped``. A
+signal must not raise an exception wherever the receiving thread happens to be: in gRPC's Python
 code that may leave a lock taken for ever, and the process then hangs in ``channel.close``.
 """
 
@@ -14,9 +14,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import Future, wait
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -24,32 +24,23 @@ from types import TracebackType
 from typing import Protocol
 
 import av
-import grpc
 import numpy as np
 
-from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.image import I420, png_bytes
-from rfcore.native.yuv import rgb_from_i420
-from rfcore.wire.address import Address, check_handshake
 from rfcore.wire.checks import check_name
-from rfcore.wire.conventions import CONSUMER_OPTIONS
-from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
     Subscription,
     TwinPicture,
-    subscription_to_wire,
-    twin_message_from_wire,
 )
-from rfcore.wire.v1 import twin_pb2_grpc
 
 __all__ = [
     "PictureFolder",
     "PictureSource",
     "PictureVideo",
-    "TwinWatcher",
     "WatchSettings",
     "watch",
     "watch_until_stopped",
@@ -57,11 +48,14 @@ __all__ = [
 
 
 TICKS_PER_S = 90_000
-"""Of a video's clock, as in MPEG systems."""
+"""Resolution of a video's times, as in MPEG systems."""
 
 
 class PictureFolder:
-    """FOLDER/VEHICLE/CAMERA/SESSION-EPOCH-SEQUENCE.png or .jpg, with a line each in index.jsonl."""
+    """Keeps pictures as FOLDER/VEHICLE/CAMERA/SESSION-EPOCH-SEQUENCE.png or .jpg.
+
+    Beside them, index.jsonl has a line for each.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -75,7 +69,7 @@ class PictureFolder:
         name += ".jpg" if is_jpeg else ".png"
         data = picture.picture
         if picture.encoding is PictureEncoding.I420:
-            data = png_bytes(rgb_from_i420(_planes(picture)))
+            data = png_bytes(picture.rgb)
         write_whole(folder / name, data)
         line = {
             "file": name,
@@ -96,7 +90,7 @@ class PictureFolder:
 
 
 class PictureVideo:
-    """One camera as H.264 in MP4; pictures of others, or of another size, are left out.
+    """Keeps one camera as H.264 in MP4; leaves out pictures of others and of another size.
 
     A picture's time is its capture, so a gap in the stream is a still in the video.
     """
@@ -130,7 +124,7 @@ class PictureVideo:
             return
         self._last_tick = tick
         stream = self._stream = self._stream or self._open(picture)
-        frame = av.VideoFrame.from_ndarray(_even(_planes(picture)), format="yuv420p")
+        frame = av.VideoFrame.from_ndarray(_even(picture.planes), format="yuv420p")
         frame.pts, frame.time_base = tick, Fraction(1, TICKS_PER_S)
         self._container.mux(stream.encode(frame))
 
@@ -150,11 +144,6 @@ def _camera(picture: TwinPicture) -> tuple[str, str, int, int]:
     return (picture.vehicle_id, picture.camera_id, k.width_px, k.height_px)
 
 
-def _planes(picture: TwinPicture) -> I420:
-    k = picture.intrinsics
-    return I420.unpacked((k.width_px, k.height_px), picture.picture)
-
-
 def _even(picture: I420) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     """Return the planes as PyAV wants them, [3/2 H, W], an odd row or column cut off."""
     height, width = (n // 2 * 2 for n in picture.y.shape)
@@ -163,9 +152,8 @@ def _even(picture: I420) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return flat.reshape(height * 3 // 2, width)
 
 
-CONNECT_S = 10.0
 LOOK_EVERY_S = 0.05
-"""How often the main thread looks whether a signal came or the watcher ended."""
+"""How often the main thread checks for a signal and for the end of the watcher."""
 
 FINISH_S = 5.0
 """How long a watcher that was told to stop may take to complete its files."""
@@ -174,36 +162,26 @@ UNFINISHED = "rfedge watch: ended before its files were complete\n"
 
 
 class PictureSource(Protocol):
-    """Where pictures come from, if not from one server."""
+    """Where pictures come from: a ``TwinClient``, or the servers of one NATS."""
 
-    def messages(self, subscription: Subscription) -> Iterator[TwinPicture | Departure]:
+    def watch(self, subscription: Subscription) -> Generator[TwinPicture | Departure, None, None]:
         """Yield what arrives until ``stop``; raise ``RfedgeError`` if the source is not there."""
 
     def stop(self) -> None:
-        """End ``messages``, from any thread."""
+        """End ``watch``, from any thread."""
 
 
 @dataclass(frozen=True)
 class WatchSettings:
-    """What to watch and what to keep; see ``rfedge watch --help``.
+    """What to watch and what to keep; see ``rfedge watch --help``."""
 
-    ``address`` None: a ``PictureSource`` is watched.
-    """
-
-    address: str | None
     vehicle_ids: frozenset[str] = frozenset()
     folder: Path | None = None
     video: Path | None = None
     encoding: str | None = None
     pictures: int | None = None
-    tls: TlsFiles | None = None
-    allow_insecure: bool = False
 
     def __post_init__(self) -> None:
-        if self.address is not None:
-            address = Address.parse("address", self.address)
-            if self.tls is None:
-                address.require_private("address", self.allow_insecure)
         for name in self.vehicle_ids:
             check_name("vehicle", name)
         if self.pictures is not None and self.pictures < 1:
@@ -215,7 +193,7 @@ class WatchSettings:
 
     @property
     def subscription(self) -> Subscription:
-        """What to ask the server for."""
+        """What to ask the source for."""
         encoding = PictureEncoding.NONE
         if self.encoding is not None:
             encoding = PictureEncoding(self.encoding)
@@ -226,100 +204,36 @@ class WatchSettings:
         return Subscription(self.vehicle_ids, encoding)
 
 
-class TwinWatcher:
-    """Receives what ``settings`` ask for from their server, or from ``source``; ``run`` on one
-    thread, ``stop`` from any other."""
+def watch(settings: WatchSettings, source: PictureSource) -> None:
+    """Print and keep what ``source`` shows, until it ends, is stopped, or enough was seen.
 
-    def __init__(self, settings: WatchSettings, source: PictureSource | None = None) -> None:
-        self._settings = settings
-        self._source = source
-        self._lock = threading.Lock()
-        self._stopped = False
-        self._call: grpc.Call | None = None
-
-    def run(self) -> None:
-        """Watch until the server ends the stream, enough was seen, or ``stop``.
-
-        Files are whole when it returns or raises. Raises ``RfedgeError`` when the server cannot be
-        reached or refuses.
-        """
-        settings, pictures = self._settings, 0
-        with ExitStack() as stack:
-            folder = PictureFolder(settings.folder) if settings.folder else None
-            video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
-            if self._source is None:
-                messages = self._messages(stack.enter_context(_open_channel(settings)))
-            else:
-                messages = self._source.messages(settings.subscription)
-            for message in messages:
-                print(_line(message), flush=True)
-                if isinstance(message, Departure):
-                    continue
-                if folder is not None:
-                    folder.keep(message)
-                if video is not None:
-                    video.keep(message)
-                pictures += 1
-                if pictures == settings.pictures:
-                    return
-
-    def stop(self) -> None:
-        """Have ``run`` return after the picture it is keeping; may be called before ``run``."""
-        with self._lock:
-            self._stopped = True
-            if self._call is not None:
-                self._call.cancel()
-            if self._source is not None:
-                self._source.stop()
-
-    def _messages(self, channel: grpc.Channel) -> Iterator[TwinPicture | Departure]:
-        request = subscription_to_wire(self._settings.subscription)
-        with self._lock:
-            if self._stopped:
+    Files are whole when it returns or raises. Raises ``RfedgeError`` if the source is not there or
+    refuses.
+    """
+    pictures = 0
+    with ExitStack() as stack:
+        folder = PictureFolder(settings.folder) if settings.folder else None
+        video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
+        messages = stack.enter_context(closing(source.watch(settings.subscription)))
+        for message in messages:
+            print(_line(message), flush=True)
+            if isinstance(message, Departure):
+                continue
+            if folder is not None:
+                folder.keep(message)
+            if video is not None:
+                video.keep(message)
+            pictures += 1
+            if pictures == settings.pictures:
                 return
-            stub = twin_pb2_grpc.TwinServiceStub(channel)
-            self._call = call = stub.Watch(request, wait_for_ready=True)
-        try:
-            self._wait_for_server(call)
-            for response in call:
-                if self._stopped:
-                    return
-                yield twin_message_from_wire(response)
-        except grpc.RpcError as error:
-            if not self._stopped:
-                raise RfedgeError(_problem(error)) from error
-
-    def _wait_for_server(self, call: grpc.Call) -> None:
-        """Wait until the server answers, or the call is cancelled; raise ``RfedgeError``."""
-        expired = threading.Event()
-
-        def expire() -> None:
-            expired.set()
-            call.cancel()
-
-        timer = threading.Timer(CONNECT_S, expire)
-        timer.start()
-        try:
-            call.initial_metadata()
-        finally:
-            timer.cancel()
-        if expired.is_set() and not self._stopped:
-            settings = self._settings
-            check_handshake(_address(settings), settings.tls)
-            raise RfedgeError(f"no server at {settings.address} within {CONNECT_S:g} s")
 
 
-def watch(settings: WatchSettings) -> None:
-    """Watch to the end; raises what ``TwinWatcher.run`` raises."""
-    TwinWatcher(settings).run()
-
-
-def watch_until_stopped(settings: WatchSettings, source: PictureSource | None = None) -> None:
+def watch_until_stopped(settings: WatchSettings, source: PictureSource) -> None:
     """Watch to the end, or until SIGINT or SIGTERM; to be called from the main thread.
 
     After the first signal files are completed. If that takes longer than ``FINISH_S``, because
     nobody reads standard output or the disk does not answer, or at a second signal, the process
-    ends at once, with status 1. Raises what ``TwinWatcher.run`` raises.
+    ends at once, with status 1. Raises what ``watch`` raises.
     """
     signals: list[int] = []
 
@@ -328,11 +242,10 @@ def watch_until_stopped(settings: WatchSettings, source: PictureSource | None = 
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        watcher = TwinWatcher(settings, source)
-        ended = _started(watcher)
+        ended = _started(settings, source)
         while not ended.done() and not signals:
             wait([ended], timeout=LOOK_EVERY_S)
-        watcher.stop()
+        source.stop()
         finish_until_s = time.monotonic() + FINISH_S
         while not ended.done():
             if len(signals) > 1 or time.monotonic() > finish_until_s:
@@ -345,13 +258,13 @@ def watch_until_stopped(settings: WatchSettings, source: PictureSource | None = 
     ended.result()
 
 
-def _started(watcher: TwinWatcher) -> Future[None]:
-    """Run ``watcher`` on a thread of its own; return what becomes of it."""
+def _started(settings: WatchSettings, source: PictureSource) -> Future[None]:
+    """Watch on a thread of its own; return its outcome."""
     ended = Future[None]()
 
     def run() -> None:
         try:
-            watcher.run()
+            watch(settings, source)
         except BaseException as error:
             ended.set_exception(error)
         else:
@@ -359,26 +272,6 @@ def _started(watcher: TwinWatcher) -> Future[None]:
 
     threading.Thread(target=run, name="watch", daemon=True).start()
     return ended
-
-
-def _open_channel(settings: WatchSettings) -> grpc.Channel:
-    address = str(_address(settings))
-    if settings.tls is None:
-        return grpc.insecure_channel(address, options=CONSUMER_OPTIONS)
-    credentials = settings.tls.channel_credentials()
-    return grpc.secure_channel(address, credentials, options=CONSUMER_OPTIONS)
-
-
-def _address(settings: WatchSettings) -> Address:
-    if settings.address is None:
-        raise InvalidInput("address", "is missing; where does mec-server listen?")
-    return Address.parse("address", settings.address)
-
-
-def _problem(error: grpc.RpcError) -> str:
-    if not isinstance(error, grpc.Call):
-        return str(error)
-    return f"{error.code().name.lower()}: {error.details()}"
 
 
 def _line(message: TwinPicture | Departure) -> str:

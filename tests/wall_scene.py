@@ -6,7 +6,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import SplatField
 from rfcore.image import jpeg_bytes
 from rfcore.raster.gaussians import Gaussians
-from rfedge.twin.scene import SeenPicture
+from rfcore.wire.twin import PictureEncoding, TwinPicture
 
 INTRINSICS = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
 WALL_M = 4.0
@@ -31,13 +31,25 @@ def wall_field(level: float) -> SplatField:
 
 
 def seen(field: SplatField, *, key: tuple[str, str] = ("cav-1", "front"), sequence: int = 0,
-         object_level: int | None = None) -> SeenPicture:  # fmt: skip
+         object_level: int | None = None) -> TwinPicture:  # fmt: skip
     """The field's own render as a vehicle's picture, with a block of 48x32 px of another level
     whose lower edge is at 48 px, if one is given."""
     camera = Camera(INTRINSICS, Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
     rgb = np.round(field.render(camera).colour.clip(0, 1) * 255).astype(np.uint8)
     if object_level is not None:
         rgb[16:48, 32:80] = object_level
-    return SeenPicture(
-        key, sequence, camera.world_from_cam, INTRINSICS, field.field_id, jpeg_bytes(rgb), 5.0
+    return TwinPicture(
+        vehicle_id=key[0],
+        camera_id=key[1],
+        session_id="session",
+        epoch=0,
+        sequence=sequence,
+        capture_time_ns=0,
+        age_ns=5_000_000,
+        pose=camera.world_from_cam,
+        intrinsics=INTRINSICS,
+        field_id=field.field_id,
+        reconstruction_digest=b"",
+        encoding=PictureEncoding.JPEG,
+        picture=jpeg_bytes(rgb),
     )

@@ -19,15 +19,14 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import grpc
 import numpy as np
 
 from lab.live.report import AgeRow, IngestRow
 from rfcore.errors import BackendUnavailable, RfedgeError
 from rfcore.extras import needs
 from rfcore.field import load_field
-from rfcore.wire.conventions import CONSUMER_OPTIONS
-from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
+from rfcore.wire.twin import TwinPicture
+from rfcore.wire.twin_client import TwinClient
 from rfedge.demo.processes import Service, command_of, service
 from rfedge.loadtest.drive import drive_prerecorded
 from rfedge.loadtest.plan import Load, Mode
@@ -81,25 +80,21 @@ class Consumer:
 
     def __init__(self, address: str) -> None:
         self.ages_ms: list[float] = []
-        self._channel = grpc.insecure_channel(address, options=CONSUMER_OPTIONS)
-        self._call = twin_pb2_grpc.TwinServiceStub(self._channel).Watch(
-            twin_pb2.WatchRequest(), wait_for_ready=True
-        )
+        self._client = TwinClient(address)
         self._thread = threading.Thread(target=self._read, name="consumer", daemon=True)
         self._thread.start()
 
     def _read(self) -> None:
-        with suppress(grpc.RpcError):  # the server, or this consumer, has ended
-            for response in self._call:
-                if response.HasField("picture"):
-                    age_ns = time.time_ns() - response.picture.capture_time_ns
-                    self.ages_ms.append(age_ns / 1e6)
+        with suppress(RfedgeError):  # the server has ended
+            for message in self._client.watch():
+                if isinstance(message, TwinPicture):
+                    self.ages_ms.append((time.time_ns() - message.capture_time_ns) / 1e6)
 
     def close(self) -> None:
         """End."""
-        self._call.cancel()
+        self._client.stop()
         self._thread.join(END_S)
-        self._channel.close()
+        self._client.close()
 
 
 @contextmanager

@@ -18,66 +18,50 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import grpc
 import numpy as np
 from rich.console import Console
 
 from lab.rig.report import CameraRow, SessionRow
 from rfcore.dataset.rig import Rig, RigCamera, RigInstant, read_rig, read_rig_drive
 from rfcore.errors import RfedgeError
-from rfcore.image import I420
 from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
-from rfcore.wire.conventions import CHANNEL_OPTIONS
-from rfcore.wire.twin import (
-    PictureEncoding,
-    Subscription,
-    TwinPicture,
-    subscription_to_wire,
-    twin_message_from_wire,
-)
-from rfcore.wire.v1 import twin_pb2_grpc
+from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
+from rfcore.wire.twin_client import TwinClient
 from rfedge.demo.processes import Service, command_of, service
 from rfedge.results import Result, as_json, make_result, provenance
 
 __all__ = ["RigJob", "Spread", "TwinKeeper", "instants_apart", "run_rig", "spreads_of"]
-
-LONGEST_MESSAGE_BYTES = 64 << 20
 
 
 class TwinKeeper:
     """Keeps the pictures of a server, in the order in which they were shown, inside ``with``."""
 
     def __init__(self, address: str) -> None:
-        length = "grpc.max_receive_message_length"
-        options = [*(o for o in CHANNEL_OPTIONS if o[0] != length), (length, LONGEST_MESSAGE_BYTES)]
-        self._channel = grpc.insecure_channel(address, options=options)
+        self._client = TwinClient(address)
         self._thread = threading.Thread(target=self._run, name="twin")
+        self._watching = threading.Event()
         self.pictures: list[TwinPicture] = []
 
     def __enter__(self) -> TwinKeeper:
-        request = subscription_to_wire(Subscription(encoding=PictureEncoding.I420))
-        stub = twin_pb2_grpc.TwinServiceStub(self._channel)
-        self._call = stub.Watch(request, wait_for_ready=True)
-        self._call.initial_metadata()
         self._thread.start()
+        self._watching.wait()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._call.cancel()
+        self._client.stop()
         self._thread.join()
-        self._channel.close()
+        self._client.close()
 
     def _run(self) -> None:
+        wanted = Subscription(encoding=PictureEncoding.I420)
         try:
-            for response in self._call:
-                message = twin_message_from_wire(response)
+            for message in self._client.watch(wanted, connected=self._watching.set):
                 if isinstance(message, TwinPicture):
                     self.pictures.append(message)
-        except grpc.RpcError as error:
-            if self._call.code() is not grpc.StatusCode.CANCELLED:
-                raise error
+        finally:
+            self._watching.set()
 
 
 @dataclass(frozen=True)
@@ -335,9 +319,7 @@ def _session_row(
 
 
 def _psnr_db(picture: PosedPicture, shown: TwinPicture) -> float:
-    k = shown.intrinsics
-    planes = I420.unpacked((k.width_px, k.height_px), shown.picture)
-    return psnr(planes.y, i420_from_rgb(picture.read()).y)
+    return psnr(shown.planes.y, i420_from_rgb(picture.read()).y)
 
 
 def _mean(values: Sequence[float]) -> float | None:

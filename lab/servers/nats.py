@@ -122,7 +122,7 @@ class _Watched:
     newest_s: dict[str, float] = field(default_factory=dict)
 
     def run(self) -> None:
-        for message in self.pictures.messages(Subscription(encoding=PictureEncoding.JPEG)):
+        for message in self.pictures.watch(Subscription(encoding=PictureEncoding.JPEG)):
             if isinstance(message, TwinPicture):
                 self.newest_s[message.vehicle_id] = time.monotonic()
 

@@ -37,17 +37,10 @@ from lab.servers.envoy import (
     envoy_binary,
 )
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tiles import Area
-from rfcore.wire.twin import (
-    PictureEncoding,
-    Subscription,
-    TwinPicture,
-    subscription_to_wire,
-    twin_message_from_wire,
-)
-from rfcore.wire.v1 import twin_pb2_grpc
+from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
+from rfcore.wire.twin_client import TwinClient
 from rfedge.datasets.convert import convert_dataset
 from rfedge.demo.processes import command_of
 from rfedge.loadtest.run import TestBed
@@ -373,7 +366,6 @@ class TwinWatch:
 
     def __init__(self) -> None:
         self.pictures: list[Shown] = []
-        self._calls: list[grpc.Call] = []
         self._problems: list[str] = []
         self._stack = ExitStack()
 
@@ -381,19 +373,15 @@ class TwinWatch:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for call in self._calls:
-            call.cancel()
         self._stack.close()
 
     def add(self, address: str) -> None:
         """Watch one more server from now on."""
-        channel = self._stack.enter_context(grpc.insecure_channel(address, CONSUMER_OPTIONS))
-        wanted = subscription_to_wire(Subscription(encoding=PictureEncoding.NONE))
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(wanted)
-        self._calls.append(call)
-        thread = threading.Thread(target=self._watch, args=(address, call), daemon=True)
+        client = self._stack.enter_context(TwinClient(address))
+        thread = threading.Thread(target=self._watch, args=(client,), daemon=True)
         thread.start()
         self._stack.callback(thread.join, WAIT_S)
+        self._stack.callback(client.stop)
 
     def result(self) -> list[Shown]:
         """Return what was shown so far; raise ``RfedgeError`` for a server that showed nothing."""
@@ -401,18 +389,16 @@ class TwinWatch:
             raise RfedgeError("; ".join(self._problems))
         return list(self.pictures)
 
-    def _watch(self, address: str, call: Iterable[Any]) -> None:
+    def _watch(self, client: TwinClient) -> None:
+        address = str(client.address)
         try:
-            for response in call:
-                message = twin_message_from_wire(response)
+            for message in client.watch(Subscription(encoding=PictureEncoding.NONE)):
                 if isinstance(message, TwinPicture):
-                    self.pictures.append(
-                        Shown(
-                            message.vehicle_id, message.camera_id, message.capture_time_ns, address
-                        )
-                    )
-        except grpc.RpcError as error:
-            if error.code() not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
+                    shown = Shown(*message.key, message.capture_time_ns, address)
+                    self.pictures.append(shown)
+        except RfedgeError as error:
+            call = error.__cause__
+            if not (isinstance(call, grpc.Call) and call.code() is grpc.StatusCode.UNAVAILABLE):
                 self._problems.append(f"{address} does not show its pictures: {error}")
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Thread
 
-import grpc
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
@@ -32,11 +31,10 @@ from rfcore.metrics import psnr
 from rfcore.perception.composition import LivePicture, compose, live_picture
 from rfcore.perception.contacts import cut_out, find
 from rfcore.perception.ground import FieldGround
-from rfcore.views import PosedPicture
-from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.notices import ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
-from rfcore.wire.twin_render import ViewRequest, render_view
+from rfcore.wire.twin_client import TwinClient
+from rfcore.wire.twin_render import ViewRequest
 from rfedge.demo.processes import command_of
 from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S
 from rfedge.loadtest.prerecorded import PrerecordedDrive, Schedule, prerecorded_drive
@@ -49,7 +47,6 @@ from rfedge.results import (
     rows_of,
     write_result,
 )
-from rfedge.twin.simulation import RATE_HZ, RecordedStreet, TwinDrive, place_of, steering_towards
 
 __all__ = ["run_world"]
 
@@ -61,7 +58,6 @@ LEAST_TOLD_S = 1e-3
 CHANGED_LEVELS, LEAST_CHANGED = 16, 0.002
 """Pixels of which the truth differs by more from that of the empty street, and the share of a view
 from which on they count."""
-SIMULATED_S = 60.0
 
 
 def run_world(asked: EvalWorld) -> None:
@@ -72,7 +68,6 @@ def run_world(asked: EvalWorld) -> None:
         "objects": lambda: object_rows(asked, field),
         "dusk": lambda: dusk_rows(asked, field),
         "views": lambda: view_rows(asked, field),
-        "simulation": lambda: simulation_rows(asked, field),
         "cost": lambda: cost_rows(asked, field),
         "notices": lambda: notice_rows(asked),
         "ingest": lambda: ingest_rows(asked),
@@ -217,39 +212,6 @@ def gain_of(field: RadianceField, live: LivePicture, true: TruePictures) -> Gain
         ((each.rgb.astype(float) - true.now)[changed] ** 2).mean() for each in (alone, composed)
     )
     return Gain(all_db, float(10 * np.log10(before / max(after, 1e-9))))
-
-
-# --- simulation
-
-
-def simulation_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
-    """Return whether a minute in the recorded street is the same twice, to the byte."""
-    pictures = Drive.given(asked.vehicles).pictures
-    first, second = (_simulated(field, pictures) for _ in range(2))
-    same = sum(one == other for one, other in zip(first, second, strict=True))
-    return [
-        WorldRow(
-            "simulation",
-            f"{SIMULATED_S:g} s driven twice: pictures, depths and objects that are the same",
-            "all",
-            f"{same} of {len(first)}, {len(set(first))} different ones",
-            same == len(first),
-        )
-    ]
-
-
-def _simulated(field: RadianceField, pictures: Sequence[PosedPicture]) -> list[bytes]:
-    """Return a digest of each step of a drive along the recording's way."""
-    way = [picture.camera.world_from_cam.translation_m[:2] for picture in pictures]
-    place = place_of(pictures[0].camera.world_from_cam)
-    drive = TwinDrive(RecordedStreet(field, [pictures]), pictures[0].camera.intrinsics)
-    seen = drive.reset(place)
-    digests = []
-    for _ in range(round(SIMULATED_S * RATE_HZ)):
-        before = drive.reset(place).place if seen.ended else seen.place
-        seen = drive.step(steering_towards(before, way), 0.5 if before.speed_mps < 5 else 0.0)
-        digests.append(seen.digest())
-    return digests
 
 
 # --- cost
@@ -462,10 +424,9 @@ def _viewing(address: str, request: ViewRequest) -> Iterator[list[int]]:
     over = Event()
 
     def look() -> None:
-        with grpc.insecure_channel(address, options=CONSUMER_OPTIONS) as channel:
+        with TwinClient(address) as client:
             while not over.is_set():
-                view = render_view(channel, replace(request, number=len(seen)))
-                seen.append(view.number)
+                seen.append(client.render(replace(request, number=len(seen))).number)
 
     thread = Thread(target=look, name="viewer")
     thread.start()

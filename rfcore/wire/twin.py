@@ -14,7 +14,10 @@ from typing import Final, cast
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec.references import Reference, References
 from rfcore.errors import InvalidInput, ProtocolError
+from rfcore.image import I420, Rgb, rgb_from_bytes
 from rfcore.localise.fix import State
+from rfcore.native.yuv import rgb_from_i420
+from rfcore.perception.objects import CameraKey
 from rfcore.wire.checks import check_name, check_range
 from rfcore.wire.sensing import (
     ClockKind,
@@ -31,6 +34,7 @@ __all__ = [
     "PictureEncoding",
     "Subscription",
     "TwinPicture",
+    "decoded_picture",
     "encoding_from_wire",
     "encoding_to_wire",
     "intrinsics_to_wire",
@@ -57,7 +61,7 @@ class PictureEncoding(StrEnum):
 
 @dataclass(frozen=True)
 class Subscription:
-    """What a consumer asks for: pictures of these vehicles (none named: all), in one encoding."""
+    """The vehicles whose pictures a consumer wants (all if none is named), and their encoding."""
 
     vehicle_ids: frozenset[str] = frozenset()
     encoding: PictureEncoding = PictureEncoding.JPEG
@@ -69,11 +73,14 @@ class Subscription:
 
 @dataclass(frozen=True)
 class TwinPicture:
-    """One reconstructed picture; ``pose`` is world_from_cam, tile-relative; ``None``: lost.
+    """One reconstructed picture.
 
-    ``payload_bytes``: of the slice it was made from, 0 from a server that does not say.
-    ``instant``: pictures of a vehicle's session with the same number were taken together; 0: the
-    camera stands alone.
+    ``pose``: world_from_cam, relative to the tile's origin; None while the vehicle is lost.
+    ``age_ns``: from capture until the server sent it. ``skipped``: pictures of this camera that
+    this consumer has missed. ``payload_bytes``: length of the slice that it was decoded from.
+    ``clock``: where a live camera's capture time comes from. ``localisation``: state of a vehicle
+    that finds its camera in the field; None if its poses are given. ``instant``: pictures of one
+    session with the same number were taken together; 0 if the camera is not part of a rig.
     """
 
     vehicle_id: str
@@ -96,6 +103,32 @@ class TwinPicture:
     localisation: State | None = None
     instant: int = 0
 
+    @property
+    def key(self) -> CameraKey:
+        """The vehicle and camera that it is of."""
+        return (self.vehicle_id, self.camera_id)
+
+    @property
+    def planes(self) -> I420:
+        """The planes of a picture that was asked for as I420: those of the vehicle, to the bit."""
+        return I420.unpacked(_size_px(self.intrinsics), self.picture)
+
+    @property
+    def rgb(self) -> Rgb:
+        """The picture as uint8 [H, W, 3]; raises ``DatasetError`` for one that did not travel."""
+        return decoded_picture(self.encoding, _size_px(self.intrinsics), self.picture)
+
+
+def decoded_picture(encoding: PictureEncoding, size_px: tuple[int, int], data: bytes) -> Rgb:
+    """Return a picture that a server sent, uint8 [H, W, 3]; raise ``DatasetError`` for none."""
+    if encoding is PictureEncoding.I420:
+        return rgb_from_i420(I420.unpacked(size_px, data))
+    return rgb_from_bytes(data, "the server's picture")
+
+
+def _size_px(k: Intrinsics) -> tuple[int, int]:
+    return (k.width_px, k.height_px)
+
 
 @dataclass(frozen=True)
 class Departure:
@@ -103,6 +136,11 @@ class Departure:
 
     vehicle_id: str
     camera_id: str
+
+    @property
+    def key(self) -> CameraKey:
+        """The vehicle and camera that it is of."""
+        return (self.vehicle_id, self.camera_id)
 
 
 def subscription_to_wire(subscription: Subscription) -> twin_pb2.WatchRequest:

@@ -1,4 +1,4 @@
-"""The street as it is now: messages of ``TwinService.Render`` and ``Objects``, and how to ask.
+"""Messages of ``TwinService.Render`` and ``Objects``: the street as it is now.
 
 What comes from a peer is checked here, as in ``rfcore.wire.twin``.
 """
@@ -8,15 +8,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Final
 
-import grpc
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, TileOrigin
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.field.quality import FULL, Quality
-from rfcore.image import I420, Rgb, rgb_from_bytes
-from rfcore.native.yuv import rgb_from_i420
+from rfcore.image import Rgb
 from rfcore.perception.objects import StreetObject
 from rfcore.wire.checks import (
     check_bytes,
@@ -28,6 +26,7 @@ from rfcore.wire.checks import (
 from rfcore.wire.convert import quality_of, quality_to_wire
 from rfcore.wire.twin import (
     PictureEncoding,
+    decoded_picture,
     encoding_from_wire,
     encoding_to_wire,
     intrinsics_to_wire,
@@ -35,7 +34,6 @@ from rfcore.wire.twin import (
     pose_to_wire,
 )
 from rfcore.wire.v1 import twin_pb2 as pb
-from rfcore.wire.v1 import twin_pb2_grpc
 
 __all__ = [
     "DEFAULT_AGE_S",
@@ -51,7 +49,6 @@ __all__ = [
     "objects_request_from_wire",
     "objects_request_to_wire",
     "objects_to_wire",
-    "render_view",
     "rendered_view_from_wire",
     "rendered_view_to_wire",
     "view_request_from_wire",
@@ -69,7 +66,6 @@ NO_AGE: Final = 65535
 """Where no live picture vouches, in ``RenderResponse.age_ms``."""
 MOST_PLACE_M: Final = 1e8
 """Of the world: more than the equator from end to end."""
-RENDER_TIMEOUT_S: Final = 30.0
 
 Vec3 = tuple[float, float, float]
 
@@ -138,9 +134,7 @@ class RenderedView:
         height, width = self.depth.shape
         if self.encoding is PictureEncoding.NONE:
             return None
-        if self.encoding is PictureEncoding.I420:
-            return rgb_from_i420(I420.unpacked((width, height), self.picture))
-        return rgb_from_bytes(self.picture, "the server's view")
+        return decoded_picture(self.encoding, (width, height), self.picture)
 
     @property
     def live(self) -> NDArray[np.bool_]:
@@ -168,17 +162,6 @@ class ObjectsSeen:
     time_ns: int
     field_id: str
     objects: tuple[StreetObject, ...]
-
-
-def render_view(
-    channel: grpc.Channel, request: ViewRequest, timeout_s: float = RENDER_TIMEOUT_S
-) -> RenderedView:
-    """Ask a server for one view; raises ``grpc.RpcError``, or ``ProtocolError`` for an answer that
-    is none to ``request``."""
-    stub = twin_pb2_grpc.TwinServiceStub(channel)
-    return rendered_view_from_wire(
-        stub.Render(view_request_to_wire(request), timeout=timeout_s), request.camera.intrinsics
-    )
 
 
 def view_request_to_wire(request: ViewRequest) -> pb.RenderRequest:

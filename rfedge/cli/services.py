@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg, subcommand
 from rfedge.arguments import ADDRESS, FOLDER, JSON
 
 if TYPE_CHECKING:
+    from rfcore.wire.twin_client import TwinClient
     from rfedge.watch import PictureSource
 
 __all__ = ["Certs", "CertsInit", "CertsShow", "Link", "Watch"]
@@ -102,25 +103,31 @@ class Watch:
     def run(self) -> None:
         """Watch until the server ends the stream, enough was seen, SIGINT or SIGTERM."""
         from rfcore.errors import InvalidInput
-        from rfcore.wire.tls import TlsFiles
         from rfedge.watch import WatchSettings, watch_until_stopped
 
-        if (self.address is None) == (self.nats is None):
-            raise InvalidInput("address", "give one: HOST:PORT of a server, or --nats URL")
-        has_server = self.address is not None
         settings = WatchSettings(
-            address=self.address,
             vehicle_ids=frozenset(self.vehicle),
             folder=self.dir,
             video=self.mp4,
             encoding=self.encoding,
             pictures=self.pictures,
-            tls=TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca) if has_server else None,
-            allow_insecure=self.allow_insecure,
         )
-        watch_until_stopped(settings, None if has_server else self._shared())
+        if (self.address is None) == (self.nats is None):
+            raise InvalidInput("address", "give one: HOST:PORT of a server, or --nats URL")
+        if self.address is None:
+            watch_until_stopped(settings, self._servers_on_nats())
+            return
+        with self._client(self.address) as client:
+            watch_until_stopped(settings, client)
 
-    def _shared(self) -> PictureSource:
+    def _client(self, address: str) -> TwinClient:
+        from rfcore.wire.tls import TlsFiles
+        from rfcore.wire.twin_client import TwinClient
+
+        tls = TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca)
+        return TwinClient(address, tls, allow_insecure=self.allow_insecure)
+
+    def _servers_on_nats(self) -> PictureSource:
         from rfedge.arguments import nats_servers
         from rfedge.twin.nats_source import NatsPictures
 

@@ -93,13 +93,14 @@ class Twin:
     def _server(self, address: str) -> Callable[[TwinScene], Source]:
         from rfcore.errors import InvalidInput
         from rfcore.wire.tls import TlsFiles
-        from rfedge.twin.server_source import ServerSource, ServerTarget
+        from rfcore.wire.twin_client import AsyncTwinClient
+        from rfedge.twin.server_source import ServerSource
 
         if self.drive is not None:
             raise InvalidInput("drive", "belongs to a field; a server shows what vehicles send")
         tls = TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca)
-        target = ServerTarget(address, self.fields, tls, self.allow_insecure)
-        return lambda scene: ServerSource(target, scene, self.threads)
+        client = AsyncTwinClient(address, tls, allow_insecure=self.allow_insecure)
+        return lambda scene: ServerSource(client, self.fields, scene, self.threads)
 
     def _field(self, target: str) -> Callable[[TwinScene], Source]:
         from rfcore.dataset import read_dataset

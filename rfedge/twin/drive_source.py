@@ -14,7 +14,8 @@ from typing import Protocol
 from rfcore.field import RadianceField, load_field
 from rfcore.image import jpeg_bytes
 from rfcore.views import PosedPicture
-from rfedge.twin.scene import PlacedField, SeenPicture, TwinScene
+from rfcore.wire.twin import PictureEncoding
+from rfedge.twin.scene import DrivePicture, PlacedField, TwinScene
 
 __all__ = ["DriveSource", "FieldVersions", "FollowedFile", "OneField"]
 
@@ -91,7 +92,7 @@ class DriveSource:
 
     @property
     def live(self) -> None:
-        """Nothing: neither objects nor views."""
+        """None: a drive shows neither objects nor views."""
 
     async def run(self) -> None:
         """Show until cancelled; raises ``DatasetError`` for a picture that cannot be read."""
@@ -116,20 +117,25 @@ class DriveSource:
         due_s, sequence = self._clock(), 0
         while True:
             picture = self._pictures[sequence % len(self._pictures)]
-            seen = await asyncio.to_thread(self._seen, picture, sequence)
-            self._scene.show(seen, self._clock())
+            shown = await asyncio.to_thread(self._picture, picture, sequence)
+            self._scene.show(shown, self._clock())
             sequence, due_s = sequence + 1, max(due_s + self._interval_s, self._clock())
             await asyncio.sleep(due_s - self._clock())
 
-    def _seen(self, picture: PosedPicture, sequence: int) -> SeenPicture:
-        return SeenPicture(
-            key=("drive", "camera"),
+    def _picture(self, picture: PosedPicture, sequence: int) -> DrivePicture:
+        return DrivePicture(
+            vehicle_id="drive",
+            camera_id="camera",
+            session_id="",
+            epoch=0,
             sequence=sequence,
+            capture_time_ns=0,
+            age_ns=0,
             pose=picture.camera.world_from_cam,
             intrinsics=picture.camera.intrinsics,
             field_id=self._field_id,
-            jpeg=jpeg_bytes(picture.read()),
-            age_ms=0.0,
-            truth=True,
-            name=picture.name,
+            reconstruction_digest=b"",
+            encoding=PictureEncoding.JPEG,
+            picture=jpeg_bytes(picture.read()),
+            file=picture.name,
         )

@@ -10,7 +10,7 @@ import asyncio
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from mec_server.nats import NatsLink, fetch_object, places_bucket, together
 from rfcore.errors import ProtocolError, RfedgeError
 from rfcore.extras import needs
 from rfcore.field import FieldStore
+from rfcore.perception.objects import CameraKey
 from rfcore.wire.nats import (
     EXPIRES_S,
     PLACE_HEADER,
@@ -34,6 +35,7 @@ from rfcore.wire.nats import (
     vehicle_of_subject,
     wanted_subject,
 )
+from rfcore.wire.newest_queue import NewestQueue
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -42,8 +44,7 @@ from rfcore.wire.twin import (
     twin_message_from_wire,
 )
 from rfcore.wire.v1 import twin_pb2
-from rfedge.twin.scene import CameraKey, PlacedField, TwinScene
-from rfedge.twin.server_source import seen_picture
+from rfedge.twin.scene import PlacedField, TwinScene
 
 with needs("nats"):
     from nats.aio.client import Client
@@ -76,7 +77,7 @@ class SharedTwin:
 
     def hear(self, place: VehiclePlace, message: TwinMessage, now: float) -> bool:
         """Take in what a server published; return whether it is to be shown."""
-        key = (message.vehicle_id, message.camera_id)
+        key = message.key
         if isinstance(message, TwinPicture):
             if not self.places.hear(place, now):
                 return False
@@ -212,7 +213,7 @@ class NatsSource:
 
     @property
     def live(self) -> None:
-        """Nothing: neither objects nor views."""
+        """None: over NATS there are neither objects nor views."""
 
     async def run(self) -> None:
         """Show pictures until cancelled; fields come over a connection of their own."""
@@ -223,9 +224,9 @@ class NatsSource:
 
     def _take(self, message: TwinMessage, place: VehiclePlace | None) -> None:
         if isinstance(message, Departure):
-            self._scene.leave((message.vehicle_id, message.camera_id), self._clock())
+            self._scene.leave(message.key, self._clock())
             return
-        self._scene.show(seen_picture(message), self._clock())
+        self._scene.show(message, self._clock())
         if place is not None and self._scene.field(place.field_id) is None:
             self._wanted[place.field_id] = place.tile or place.field_id[:8]
             self._asked.set()
@@ -270,11 +271,11 @@ class NatsPictures:
         self._lock = threading.Lock()
         self._stopped = False
         self._wake: Callable[[], None] = lambda: None
-        self._waiting: OrderedDict[tuple[CameraKey, type], TwinMessage] = OrderedDict()
+        self._waiting = NewestQueue[tuple[CameraKey, type], TwinMessage](lambda: self._wake())
         self._is_connected = False
         self._detail = ""
 
-    def messages(self, subscription: Subscription) -> Iterator[TwinMessage]:
+    def watch(self, subscription: Subscription) -> Generator[TwinMessage, None, None]:
         """Yield what arrives until ``stop``; raise ``RfedgeError`` if there is no NATS at first."""
         with asyncio.Runner() as runner:
             loop, arrived = runner.get_loop(), asyncio.Event()
@@ -286,22 +287,20 @@ class NatsPictures:
             while not self._stopped:
                 if not self._waiting:
                     runner.run(_until(reading, arrived))
-                if self._waiting and not self._stopped:
-                    yield self._waiting.popitem(last=False)[1]
+                elif (message := self._waiting.take()) is not None:
+                    yield message
             reading.cancel()
 
     def stop(self) -> None:
-        """End ``messages``; may be called from any thread, and before it."""
+        """End ``watch``; may be called from any thread, and before it."""
         with self._lock:
             self._stopped = True
             self._wake()
 
     def _take(self, message: TwinMessage, _: VehiclePlace | None) -> None:
-        key = (message.vehicle_id, message.camera_id)
         if isinstance(message, TwinPicture):
-            self._waiting.pop((key, Departure), None)
-        self._waiting[key, type(message)] = message
-        self._wake()
+            self._waiting.discard((message.key, Departure))
+        self._waiting.put((message.key, type(message)), message)
 
     def _say(self, connected: bool, detail: str) -> None:
         self._is_connected, self._detail = connected, detail

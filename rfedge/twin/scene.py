@@ -1,28 +1,91 @@
-"""The scene of the page: fields where they lie, cameras with their newest pictures.
+"""What the page shows: fields where they lie, cameras with their newest pictures.
 
-Positions sent to the page are metres relative to the first field's tile origin, so that they are
-small enough for the browser's float32.
+``TwinScene`` turns changes into messages, ``Board`` keeps the newest message of every key for each
+browser. Without event loop or clock. Positions sent to the page are metres relative to the first
+field's tile origin, so that they are small enough for the browser's float32.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import struct
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rfcore.camera import Intrinsics, Pose, TileOrigin
+from rfcore.camera import Intrinsics, TileOrigin
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.spz import encode_spz
-from rfcore.localise.fix import State
-from rfcore.perception.objects import StreetObject
-from rfcore.wire.sensing import ClockKind
-from rfedge.twin.board import Board, Message
+from rfcore.perception.objects import CameraKey, StreetObject
+from rfcore.wire.newest_queue import NewestQueue
+from rfcore.wire.twin import TwinPicture
 
-__all__ = ["CameraKey", "PlacedField", "SeenPicture", "TwinScene"]
+__all__ = ["Board", "DrivePicture", "Message", "PlacedField", "Reader", "TwinScene"]
 
-CameraKey = tuple[str, str]
-"""(vehicle, camera)"""
 CONNECTION, FIELDS, TILES = ("connection",), ("fields",), ("tiles",)
+
+
+@dataclass(frozen=True)
+class Message:
+    """A JSON object for the page with the binary ``parts`` it names; made at ``made_s``.
+
+    ``parts`` travel one after the other; the header's ``part_bytes`` says how long each is.
+    """
+
+    header: Mapping[str, Any]
+    made_s: float
+    parts: tuple[bytes, ...] = ()
+
+    def encode(self, now_s: float) -> bytes:
+        """Return it as one WebSocket message: length of the header (uint32, little-endian), header,
+        parts. ``held_ms`` tells how long it waited here (``now_s``: the clock of ``made_s``)."""
+        header = {
+            **self.header,
+            "held_ms": 1000.0 * max(0.0, now_s - self.made_s),
+            "part_bytes": [len(part) for part in self.parts],
+        }
+        text = json.dumps(header, allow_nan=False).encode()
+        return b"".join((struct.pack("<I", len(text)), text, *self.parts))
+
+
+Reader = NewestQueue[Hashable, Message]
+"""The messages that one browser has not been sent."""
+
+
+class Board:
+    """The newest message of every key, and the browsers that read them.
+
+    A message replaces the one before it under the same key: a camera's picture, the list of fields,
+    the state of the connection.
+    """
+
+    def __init__(self) -> None:
+        self._messages: dict[Hashable, Message] = {}
+        self._readers: list[Reader] = []
+
+    def post(self, key: Hashable, message: Message) -> None:
+        """Show ``message`` to all readers, also to those that come later."""
+        self._messages[key] = message
+        for reader in self._readers:
+            reader.put(key, message)
+
+    def clear(self, key: Hashable, farewell: Message) -> None:
+        """Remove the message of ``key``; present readers get ``farewell`` instead."""
+        if self._messages.pop(key, None) is not None:
+            for reader in self._readers:
+                reader.put(key, farewell)
+
+    def read(self, arrived: Callable[[], None]) -> Reader:
+        """Return a new reader with everything that is shown now; ``arrived`` is called for more."""
+        reader = Reader(arrived)
+        for key, message in self._messages.items():
+            reader.put(key, message)
+        self._readers.append(reader)
+        return reader
+
+    def leave(self, reader: Reader) -> None:
+        """Remove a reader."""
+        self._readers.remove(reader)
 
 
 @dataclass(frozen=True)
@@ -43,49 +106,25 @@ class PlacedField:
 
 
 @dataclass(frozen=True)
-class SeenPicture:
-    """A camera's picture as JPEG: ``pose`` is world_from_cam, relative to its field's tile;
-    ``None``: the vehicle is lost.
+class DrivePicture(TwinPicture):
+    """A camera's own picture from a drive on disk, which nobody has sent; ``file``: its name."""
 
-    ``age_ms``: from capture until this process had it. ``payload_bytes``: 0 where not known.
-    ``clock``: what a live camera's capture time rests on. ``localisation``: of a vehicle that finds
-    its camera in the field; ``None``: the pose was given. ``truth``: ``jpeg`` is what the camera
-    saw, not what a receiver made of it; ``name``: its file in the drive.
-    ``instant``: of a rig, which pictures of its cameras were taken together; 0: the camera stands
-    alone.
-    """
-
-    key: CameraKey
-    sequence: int
-    pose: Pose | None
-    intrinsics: Intrinsics
-    field_id: str
-    jpeg: bytes
-    age_ms: float
-    capture_time_ns: int = 0
-    payload_bytes: int = 0
-    references: tuple[str, ...] = ()
-    skipped: int = 0
-    clock: ClockKind | None = None
-    localisation: State | None = None
-    truth: bool = False
-    name: str = ""
-    instant: int = 0
+    file: str = ""
 
 
 class TwinScene:
-    """Fields and cameras, told to the ``board`` as they change. Used by one thread."""
+    """Fields and cameras; posts each change to the ``board``. Not thread-safe."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
         self._fields: dict[str, PlacedField] = {}
         self._notes: dict[str, str] = {}
-        self._newest: dict[CameraKey, SeenPicture] = {}
+        self._newest: dict[CameraKey, TwinPicture] = {}
         self._origin: TileOrigin | None = None
         self._tiles: Mapping[str, Any] = {}
 
     @property
-    def newest(self) -> Mapping[CameraKey, SeenPicture]:
+    def newest(self) -> Mapping[CameraKey, TwinPicture]:
         """The newest picture of every camera."""
         return self._newest
 
@@ -99,7 +138,7 @@ class TwinScene:
         return self._fields.get(field_id)
 
     def connection(self, state: str, detail: str, now_s: float) -> None:
-        """Tell whether pictures can come: ``state`` is connected, waiting or offline."""
+        """Show whether pictures can arrive: ``state`` is connected, waiting or offline."""
         header = {"kind": "connection", "state": state, "detail": detail}
         self._board.post(CONNECTION, Message(header, now_s))
 
@@ -114,33 +153,33 @@ class TwinScene:
         self._post_fields(now_s)
 
     def note(self, tile: str, text: str, now_s: float) -> None:
-        """Say beside the fields what becomes of one that is not there."""
+        """Show, beside the fields, the state of one that is not there yet."""
         self._notes[tile] = text
         self._post_fields(now_s)
 
-    def show(self, picture: SeenPicture, now_s: float) -> None:
-        """Take in a camera's picture."""
+    def show(self, picture: TwinPicture, now_s: float) -> None:
+        """Show a camera's picture, a JPEG."""
         self._newest[picture.key] = picture
         header = {
             "kind": "picture",
             **_name(picture.key),
             "sequence": picture.sequence,
             "capture_time_ms": picture.capture_time_ns / 1e6,
-            "age_ms": picture.age_ms,
+            "age_ms": picture.age_ns / 1e6,
             "field": picture.field_id,
             "origin_m": self._offset_m(picture.field_id),
             "translation_m": picture.pose and picture.pose.translation_m,
             "rotation_wxyz": picture.pose and picture.pose.rotation,
             "intrinsics": _intrinsics(picture.intrinsics),
             "payload_bytes": picture.payload_bytes,
-            "references": picture.references,
+            "references": [reference.name.lower() for reference in picture.references],
             "skipped": picture.skipped,
             "clock": picture.clock,
             "localisation": picture.localisation,
-            "truth": picture.truth,
+            "truth": isinstance(picture, DrivePicture),
             "instant": picture.instant,
         }
-        self._board.post(("picture", picture.key), Message(header, now_s, (picture.jpeg,)))
+        self._board.post(("picture", picture.key), Message(header, now_s, (picture.picture,)))
 
     def leave(self, key: CameraKey, now_s: float) -> None:
         """Remove a camera."""
@@ -151,7 +190,7 @@ class TwinScene:
 
     def compare(
         self,
-        picture: SeenPicture,
+        picture: TwinPicture,
         comparison: Mapping[str, Any],
         parts: tuple[bytes, ...],
         now_s: float,
@@ -161,12 +200,12 @@ class TwinScene:
             "kind": "comparison",
             **_name(picture.key),
             "sequence": picture.sequence,
-            "name": picture.name,
+            "name": picture.file if isinstance(picture, DrivePicture) else "",
             "origin_m": self._offset_m(picture.field_id),
             **comparison,
         }
         key = ("comparison", picture.key)
-        self._board.post(key, Message(header, now_s, (picture.jpeg, *parts)))
+        self._board.post(key, Message(header, now_s, (picture.picture, *parts)))
 
     def show_tiles(self, rows: Sequence[Mapping[str, Any]], now_s: float) -> None:
         """Show these rows as the table of tiles and their lights; nothing if they are shown."""

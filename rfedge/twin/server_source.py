@@ -1,7 +1,7 @@
-"""Fields, pictures, objects and views from a mec-server: a consumer of its services like any other.
+"""Fields, pictures, objects and views of one server, for the page.
 
-Survives restarts of the server: what was shown stays, and says that it waits. Objects and views
-take the server's time, so they are asked for only while a browser shows them.
+Survives restarts of the server: what was shown stays, and the page says that it waits. Objects and
+views take the server's time, so they are asked for only while a browser shows them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import asyncio
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,43 +21,26 @@ from numpy.typing import NDArray
 from cav_agent.field_fetch import fetch_field
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
 from rfcore.field import FieldStore
-from rfcore.wire.address import Address
-from rfcore.wire.conventions import CONSUMER_OPTIONS
+from rfcore.perception.objects import CameraKey
 from rfcore.wire.tiles import LearntLight, Tile, TileLight, learnt_of, tile_of
-from rfcore.wire.tls import TlsFiles
-from rfcore.wire.twin import (
-    Departure,
-    PictureEncoding,
-    Subscription,
-    TwinPicture,
-    subscription_to_wire,
-    twin_message_from_wire,
-)
+from rfcore.wire.twin import Departure, TwinPicture
+from rfcore.wire.twin_client import AsyncTwinClient
 from rfcore.wire.twin_render import (
     NO_AGE,
     ObjectsRequest,
     RenderedView,
     ViewRequest,
-    objects_from_wire,
-    objects_request_to_wire,
     rendered_view_from_wire,
     view_request_to_wire,
 )
 from rfcore.wire.v1 import field_pb2, twin_pb2, twin_pb2_grpc
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
-from rfedge.twin.board import Message
-from rfedge.twin.scene import CameraKey, PlacedField, SeenPicture, TwinScene
+from rfedge.twin.scene import Message, PlacedField, TwinScene
 
-__all__ = ["LiveView", "ServerSource", "ServerTarget", "seen_picture", "tile_rows", "view_message"]
+__all__ = ["LiveView", "ServerSource", "tile_rows", "view_message"]
 
 log = structlog.get_logger()
 
-REFUSED = (
-    grpc.StatusCode.PERMISSION_DENIED,
-    grpc.StatusCode.UNAUTHENTICATED,
-    grpc.StatusCode.UNIMPLEMENTED,
-)
-"""What does not pass by waiting."""
 RETRY_S = 0.5
 FIELDS_EVERY_S = 5.0
 OBJECTS_AGAIN_S = 0.5
@@ -71,48 +53,27 @@ FIELD_ALONE = 255
 most 254."""
 
 
-@dataclass(frozen=True)
-class ServerTarget:
-    """Which server, and how to speak to it. Raises ``InvalidInput`` for plaintext that would leave
-    the machine without permission."""
-
-    address: str
-    fields: Path
-    """Where fields are kept once they are fetched."""
-    tls: TlsFiles | None = None
-    allow_insecure: bool = False
-
-    def __post_init__(self) -> None:
-        address = Address.parse("address", self.address)
-        if self.tls is None:
-            address.require_private("address", self.allow_insecure)
-
-    def channel(self) -> grpc.aio.Channel:
-        """Return a channel to the server."""
-        if self.tls is None:
-            return grpc.aio.insecure_channel(self.address, options=CONSUMER_OPTIONS)
-        return grpc.aio.secure_channel(
-            self.address, self.tls.channel_credentials(), options=CONSUMER_OPTIONS
-        )
-
-
 class ServerSource:
-    """Tells ``scene`` what a server shows. ``threads`` render each field that is fetched."""
+    """Shows in ``scene`` what the server of ``client`` shows.
+
+    Fields that are fetched are kept in ``folder``; ``threads`` render each of them.
+    """
 
     def __init__(
         self,
-        target: ServerTarget,
+        client: AsyncTwinClient,
+        folder: Path,
         scene: TwinScene,
         threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._target = target
+        self._client = client
+        self._folder = folder
         self._scene = scene
         self._threads = threads
         self._clock = clock
-        self._store = FieldStore(target.fields)
+        self._store = FieldStore(folder)
         self._cameras: set[CameraKey] = set()
-        self._channel: grpc.aio.Channel | None = None
         self._showing_objects = 0
 
     @property
@@ -121,31 +82,29 @@ class ServerSource:
         return self
 
     async def run(self) -> None:
-        """Watch until cancelled; raises ``AccessDenied`` where the server does not let us."""
-        async with self._target.channel() as channel:
-            self._channel = channel
-            fields = asyncio.create_task(self._follow_fields(channel))
-            objects = asyncio.create_task(self._follow_objects(channel))
+        """Show until cancelled; raises ``AccessDenied`` where the server does not let us."""
+        async with self._client:
+            fields = asyncio.create_task(self._follow_fields())
+            objects = asyncio.create_task(self._follow_objects())
             try:
                 while True:
-                    problem = await self._watch(channel)
-                    self._say("waiting", problem)
+                    problem = await self._watch()
+                    self._show_state("waiting", problem)
                     await asyncio.sleep(RETRY_S)
             finally:
-                self._channel = None
                 fields.cancel()
                 objects.cancel()
 
-    def open_view(self, tell: Callable[[Message], None]) -> LiveView:
-        """Return a view for one browser, which is told of it by ``tell``."""
-        return LiveView(lambda: self._channel, tell, self._clock)
+    def open_view(self, send: Callable[[Message], object]) -> LiveView:
+        """Return a view for one browser; ``send`` takes its messages."""
+        return LiveView(self._client, send, self._clock)
 
     def want_objects(self, wanted: bool) -> None:
         """Count one browser more, or less, that shows objects."""
         self._showing_objects += 1 if wanted else -1
 
-    async def _follow_objects(self, channel: grpc.aio.Channel) -> None:
-        """Tell the scene of the objects on every field's ground, while anybody wants them."""
+    async def _follow_objects(self) -> None:
+        """Show the objects on every field's ground, while a browser shows them."""
         following: dict[str, asyncio.Task[None]] = {}
         try:
             while True:
@@ -154,73 +113,62 @@ class ServerSource:
                 for field_id in (following.keys() - wanted) | ended:
                     following.pop(field_id).cancel()
                 for field_id in following.keys() ^ wanted:
-                    watching = self._watch_objects(channel, field_id)
-                    following[field_id] = asyncio.create_task(watching)
+                    following[field_id] = asyncio.create_task(self._watch_objects(field_id))
                 await asyncio.sleep(OBJECTS_AGAIN_S)
         finally:
             for task in following.values():
                 task.cancel()
 
-    async def _watch_objects(self, channel: grpc.aio.Channel, field_id: str) -> None:
-        """Show the objects on one field's ground until the stream ends, and for a while why."""
-        request = objects_request_to_wire(ObjectsRequest(field_id=field_id))
-        call = twin_pb2_grpc.TwinServiceStub(channel).Objects(request)
+    async def _watch_objects(self, field_id: str) -> None:
+        """Show the objects on one field's ground until the stream ends, then the reason."""
+        problem = "the server ended the stream"
         try:
-            problem = "the server ended the stream"
             try:
-                async for response in call:
-                    seen = objects_from_wire(response)
+                async for seen in self._client.objects(ObjectsRequest(field_id=field_id)):
                     self._scene.show_objects(field_id, seen.objects, self._clock())
-            except grpc.aio.AioRpcError as error:
-                problem = str(error.details())
-            except ProtocolError as error:
+            except RfedgeError as error:
                 problem = str(error)
             self._scene.show_objects(field_id, (), self._clock(), problem)
             await asyncio.sleep(FIELDS_EVERY_S)
         finally:
-            call.cancel()
             self._scene.hide_objects(field_id, self._clock())
 
-    def _say(self, state: str, detail: str) -> None:
+    def _show_state(self, state: str, detail: str) -> None:
         self._scene.connection(state, detail, self._clock())
 
-    async def _watch(self, channel: grpc.aio.Channel) -> str:
-        """Show pictures until the stream ends; return why it did."""
-        self._say("waiting", f"connecting to {self._target.address}")
-        request = subscription_to_wire(Subscription(encoding=PictureEncoding.JPEG))
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(request, wait_for_ready=True)
+    async def _watch(self) -> str:
+        """Show pictures until the stream ends; return the reason."""
+        address = str(self._client.address)
+        self._show_state("waiting", f"connecting to {address}")
+        messages = self._client.watch(connected=lambda: self._show_state("connected", address))
         try:
-            await call.initial_metadata()
-            self._say("connected", self._target.address)
-            async for response in call:
-                self._take(twin_message_from_wire(response))
-        except grpc.aio.AioRpcError as error:
-            return _problem(error, "TwinService.Watch")
-        except (ProtocolError, InvalidInput) as error:
-            log.warning("the server sent what cannot be shown", problem=str(error))
+            async for message in messages:
+                self._take(message)
+        except AccessDenied:
+            raise
+        except RfedgeError as error:
+            log.warning("the twin ended", problem=str(error))
             return str(error)
         finally:
-            call.cancel()
             self._depart_all()
         return "the server ended the stream"
 
     def _take(self, message: TwinPicture | Departure) -> None:
-        key = (message.vehicle_id, message.camera_id)
         if isinstance(message, Departure):
-            self._cameras.discard(key)
-            self._scene.leave(key, self._clock())
+            self._cameras.discard(message.key)
+            self._scene.leave(message.key, self._clock())
             return
-        self._cameras.add(key)
-        self._scene.show(seen_picture(message), self._clock())
+        self._cameras.add(message.key)
+        self._scene.show(message, self._clock())
 
     def _depart_all(self) -> None:
         for key in self._cameras:
             self._scene.leave(key, self._clock())
         self._cameras.clear()
 
-    async def _follow_fields(self, channel: grpc.aio.Channel) -> None:
+    async def _follow_fields(self) -> None:
         """Fetch each field that the server publishes, and those that replace them."""
-        stub = FieldServiceStub(channel)
+        stub = FieldServiceStub(self._client.channel)
         while True:
             try:
                 request = field_pb2.ListFieldsRequest()
@@ -228,13 +176,13 @@ class ServerSource:
                 self._show_tiles(listed)
                 tiles = {tile.name: tile.field_id for tile in listed.tiles}
                 for tile, field_id in (tiles or {i[:8]: i for i in listed.field_ids}).items():
-                    await self._bring(channel, tile, field_id)
+                    await self._bring(tile, field_id)
             except grpc.aio.AioRpcError as error:
                 log.info("fields cannot be listed", problem=error.details())
             await asyncio.sleep(FIELDS_EVERY_S)
 
     def _show_tiles(self, listed: field_pb2.ListFieldsResponse) -> None:
-        """Have the page show which lights the tiles have, and what was learnt of them."""
+        """Show which lights the tiles have, and what was learnt of them."""
         try:
             tiles, learnt = map(tile_of, listed.tiles), map(learnt_of, listed.learnt)
             rows = tile_rows(tuple(tiles), tuple(learnt))
@@ -243,13 +191,13 @@ class ServerSource:
             return
         self._scene.show_tiles(rows, self._clock())
 
-    async def _bring(self, channel: grpc.aio.Channel, tile: str, field_id: str) -> None:
+    async def _bring(self, tile: str, field_id: str) -> None:
         if self._scene.field(field_id) is not None:
             return
         self._scene.note(tile, "being fetched", self._clock())
         try:
             if field_id not in await asyncio.to_thread(self._store.ids):
-                await fetch_field(channel, self._store, field_id, self._target.fields)
+                await fetch_field(self._client.channel, self._store, field_id, self._folder)
             placed = await asyncio.to_thread(self._placed, tile, field_id)
         except (RfedgeError, OSError) as error:
             log.warning("field cannot be shown", field=field_id, problem=str(error))
@@ -262,20 +210,21 @@ class ServerSource:
 
 
 class LiveView:
-    """What one browser sees through a camera that its user moves: ``RenderStream``, asked again and
-    again while it is open, at most once in ``VIEW_EVERY_S``.
+    """The view of one browser through a camera that its user moves: ``RenderStream``, asked again
+    and again while it is open, at most once in ``VIEW_EVERY_S``.
 
-    A refusal is told and ends the stream; the next viewpoint opens another. Used on the event loop.
+    A refusal is shown and ends the stream; the next viewpoint opens another. Used on the event
+    loop.
     """
 
     def __init__(
         self,
-        channel: Callable[[], grpc.aio.Channel | None],
-        tell: Callable[[Message], None],
+        client: AsyncTwinClient,
+        send: Callable[[Message], object],
         clock: Callable[[], float],
     ) -> None:
-        self._channel = channel
-        self._tell = tell
+        self._client = client
+        self._send = send
         self._clock = clock
         self._wanted: ViewRequest | None = None
         self._following: asyncio.Task[None] | None = None
@@ -295,11 +244,11 @@ class LiveView:
             self._following = None
 
     async def _follow(self) -> None:
-        channel = self._channel()
-        if channel is None:
-            self._refused("there is no connection to the server")
+        try:
+            call = twin_pb2_grpc.TwinServiceStub(self._client.channel).RenderStream()
+        except RfedgeError as error:
+            self._refused(str(error))
             return
-        call = twin_pb2_grpc.TwinServiceStub(channel).RenderStream()
         try:
             await self._ask(call)
         except grpc.aio.AioRpcError as error:
@@ -321,11 +270,11 @@ class LiveView:
                 return
             intrinsics = request.camera.intrinsics
             view = rendered_view_from_wire(response.view, intrinsics)
-            self._tell(await asyncio.to_thread(view_message, view, self._clock()))
+            self._send(await asyncio.to_thread(view_message, view, self._clock()))
             await asyncio.sleep(max(0.0, VIEW_EVERY_S - (self._clock() - asked_s)))
 
     def _refused(self, problem: str) -> None:
-        self._tell(Message({"kind": "view_refused", "problem": problem}, self._clock()))
+        self._send(Message({"kind": "view_refused", "problem": problem}, self._clock()))
 
 
 def tile_rows(tiles: Sequence[Tile], learnt: Sequence[LearntLight]) -> list[dict[str, Any]]:
@@ -393,29 +342,3 @@ def view_message(view: RenderedView, now_s: float) -> Message:
 def _freshness(age_ms: NDArray[np.uint16]) -> bytes:
     steps = np.minimum(age_ms // FRESHNESS_STEP_MS, FIELD_ALONE - 1)
     return np.where(age_ms == NO_AGE, FIELD_ALONE, steps).astype(np.uint8).tobytes()
-
-
-def seen_picture(picture: TwinPicture) -> SeenPicture:
-    """Return a server's picture as the page shows it."""
-    return SeenPicture(
-        key=(picture.vehicle_id, picture.camera_id),
-        sequence=picture.sequence,
-        pose=picture.pose,
-        intrinsics=picture.intrinsics,
-        field_id=picture.field_id,
-        jpeg=picture.picture,
-        age_ms=picture.age_ns / 1e6,
-        capture_time_ns=picture.capture_time_ns,
-        payload_bytes=picture.payload_bytes,
-        references=tuple(r.name.lower() for r in picture.references),
-        skipped=picture.skipped,
-        clock=picture.clock,
-        localisation=picture.localisation,
-        instant=picture.instant,
-    )
-
-
-def _problem(error: grpc.aio.AioRpcError, call: str) -> str:
-    if error.code() in REFUSED:
-        raise AccessDenied(f"{call}: {error.details()}") from error
-    return f"{error.code().name.lower()}: {error.details()}"

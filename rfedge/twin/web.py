@@ -25,11 +25,11 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
 from rfcore.files import write_whole
+from rfcore.perception.objects import CameraKey
 from rfcore.wire.address import Address
 from rfcore.wire.twin_render import ViewRequest
-from rfedge.twin.board import Board, Message, Reader
 from rfedge.twin.comparing import Comparer
-from rfedge.twin.scene import CameraKey, TwinScene
+from rfedge.twin.scene import Board, Message, Reader, TwinScene
 
 with needs("twin"):
     from aiohttp import WSCloseCode, WSMsgType, web
@@ -122,8 +122,8 @@ class MovingView(Protocol):
 class LiveSource(Protocol):
     """What can show more than pictures: objects, and the street from anywhere."""
 
-    def open_view(self, tell: Callable[[Message], None]) -> MovingView:
-        """Return a view for one browser, which is told of it by ``tell``."""
+    def open_view(self, send: Callable[[Message], object]) -> MovingView:
+        """Return a view for one browser; ``send`` takes its messages."""
 
     def want_objects(self, wanted: bool) -> None:
         """Count one browser more, or less, that shows objects."""

@@ -30,9 +30,8 @@ from rfcore.wire.tiles import Area
 from rfcore.wire.twin import Departure, PictureEncoding, Subscription, TwinPicture
 from rfedge.certs import Members, certify, write_certificates
 from rfedge.results import read_result, rows_of
-from rfedge.twin.board import Board
 from rfedge.twin.nats_source import NatsPictures, NatsReader, NatsSource, TwinMessage
-from rfedge.twin.scene import TwinScene
+from rfedge.twin.scene import Board, TwinScene
 
 pytestmark = pytest.mark.slow
 
@@ -308,7 +307,7 @@ async def test_a_thread_that_watches_gets_pictures_in_its_encoding_until_it_is_s
 
     def watch() -> list[TwinMessage]:
         got = []
-        for message in pictures.messages(wanted):
+        for message in pictures.watch(wanted):
             got.append(message)
             if isinstance(message, Departure):
                 pictures.stop()

@@ -24,9 +24,9 @@ from rfcore.wire.twin import (
     subscription_to_wire,
     twin_message_from_wire,
 )
+from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.certs import Members, certify, write_certificates
-from rfedge.watch import WatchSettings, watch
 
 Files = Callable[[str], TlsFiles]
 SOON_S = AgentLimits(give_up_s=5.0)
@@ -259,14 +259,14 @@ def test_a_watcher_in_plaintext_is_told_what_is_missing(
     certs: Files, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server here is one handshake: what the watcher says does not need more."""
-    monkeypatch.setattr("rfedge.watch.CONNECT_S", 0.1)
+    monkeypatch.setattr("rfcore.wire.twin_client.CONNECT_S", 0.1)
     credentials = certs("server").server_credentials()
     server = grpc.server(None)
     port = server.add_secure_port("127.0.0.1:0", credentials)
     server.start()
     try:
         with pytest.raises(AccessDenied, match="wants TLS"):
-            watch(WatchSettings(f"127.0.0.1:{port}"))
+            list(TwinClient(f"127.0.0.1:{port}").watch())
     finally:
         server.stop(None).wait()
 

@@ -19,11 +19,11 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import rgb_from_bytes
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tile_manifest import VersionLabel
+from rfcore.wire.twin_client import AsyncTwinClient
 from rfcore.wire.twin_render import ViewRequest
 from rfedge.twin import server_source
-from rfedge.twin.board import Board, Message
-from rfedge.twin.scene import TwinScene
-from rfedge.twin.server_source import FIELD_ALONE, ServerSource, ServerTarget
+from rfedge.twin.scene import Board, Message, TwinScene
+from rfedge.twin.server_source import FIELD_ALONE, ServerSource
 
 INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 NEAR = Camera(INTRINSICS, Pose.identity())
@@ -63,7 +63,7 @@ class Browser:
 @asynccontextmanager
 async def following(server: Any, folder: Path) -> AsyncIterator[tuple[ServerSource, Browser]]:
     board = Board()
-    source = ServerSource(ServerTarget(str(server.address), folder), TwinScene(board))
+    source = ServerSource(AsyncTwinClient(str(server.address)), folder, TwinScene(board))
     browser = Browser(board)
     running = asyncio.create_task(source.run())
     try:
@@ -123,8 +123,9 @@ async def test_the_operator_sees_the_lights_of_a_tile_and_what_was_learnt(
         server._show_learnt({"west": TileHistory((learnt,)), "gone": TileHistory((learnt,))})
         board = Board()
         browser = Browser(board)
-        target = ServerTarget(str(server.address), tmp_path / "mine")
-        running = asyncio.create_task(ServerSource(target, TwinScene(board)).run())
+        client = AsyncTwinClient(str(server.address))
+        source = ServerSource(client, tmp_path / "mine", TwinScene(board))
+        running = asyncio.create_task(source.run())
         rows = (await browser.next("tiles"))["rows"]
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
@@ -137,7 +138,7 @@ async def test_the_operator_sees_the_lights_of_a_tile_and_what_was_learnt(
 
 
 async def test_a_view_without_a_server_says_so(tmp_path: Path) -> None:
-    source = ServerSource(ServerTarget("127.0.0.1:1", tmp_path), TwinScene(Board()))
+    source = ServerSource(AsyncTwinClient("127.0.0.1:1"), tmp_path, TwinScene(Board()))
     told: asyncio.Queue[Message] = asyncio.Queue()
     source.open_view(told.put_nowait).look(ViewRequest(NEAR, field_id="0" * 64))
     message = await asyncio.wait_for(told.get(), 30)

@@ -28,13 +28,13 @@ from rfcore.wire.messages import Frame
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import PictureEncoding
+from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.twin_render import (
     NO_AGE,
     ObjectsRequest,
     ViewRequest,
     objects_from_wire,
     objects_request_to_wire,
-    render_view,
     rendered_view_from_wire,
     view_request_to_wire,
 )
@@ -78,8 +78,8 @@ async def test_a_view_is_the_field_with_what_a_vehicle_sees_now(
     aside = Camera(INTRINSICS, Pose((0.05, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
 
     def look() -> Any:
-        with grpc.insecure_channel(str(server.address), options=CONSUMER_OPTIONS) as channel:
-            return render_view(channel, asked(street, aside, number=7))
+        with TwinClient(str(server.address)) as client:
+            return client.render(asked(street, aside, number=7))
 
     async with serve() as server:
         empty = await asyncio.to_thread(look)

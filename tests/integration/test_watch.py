@@ -16,8 +16,7 @@ import pytest
 
 from mec_server.config import ServerBudget, SessionLimits
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.image import I420, read_rgb
-from rfcore.native.yuv import rgb_from_i420
+from rfcore.image import read_rgb
 from rfcore.wire.conventions import CHANNEL_OPTIONS
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.twin import (
@@ -28,6 +27,7 @@ from rfcore.wire.twin import (
     subscription_to_wire,
     twin_message_from_wire,
 )
+from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.demo.processes import command_of
 from rfedge.watch import WatchSettings, watch
@@ -54,11 +54,6 @@ async def seen_until_departure(call: Any) -> list[TwinPicture]:
     return pictures
 
 
-def planes(picture: TwinPicture) -> I420:
-    k = picture.intrinsics
-    return I420.unpacked((k.width_px, k.height_px), picture.picture)
-
-
 async def test_a_consumer_sees_to_the_bit_what_the_vehicle_holds(serve: Any, travel: Any) -> None:
     async with (
         serve() as server,
@@ -71,7 +66,7 @@ async def test_a_consumer_sees_to_the_bit_what_the_vehicle_holds(serve: Any, tra
     assert pictures[-1].sequence == 5, "the newest is always seen"
     assert len(pictures) + pictures[-1].skipped == 6
     for picture in pictures:
-        assert planes(picture).digest() == picture.reconstruction_digest
+        assert picture.planes.digest() == picture.reconstruction_digest
         assert picture.reconstruction_digest.hex() == held[picture.sequence]
         assert (picture.vehicle_id, picture.camera_id) == ("cav-1", "front")
         assert picture.age_ns > 0
@@ -79,7 +74,7 @@ async def test_a_consumer_sees_to_the_bit_what_the_vehicle_holds(serve: Any, tra
 
 @pytest.mark.parametrize(("encoding", "worst"), [("png", 0), ("jpeg", 12), ("none", None)])
 async def test_a_picture_comes_in_the_encoding_that_was_asked_for(
-    serve: Any, travel: Any, tmp_path: Path, encoding: str, worst: int | None
+    serve: Any, travel: Any, encoding: str, worst: int | None
 ) -> None:
     """JPEG at quality 90 with half the chroma stays within a few levels on average."""
     async with serve() as server:
@@ -95,8 +90,7 @@ async def test_a_picture_comes_in_the_encoding_that_was_asked_for(
     if worst is None:
         assert picture.picture == b""
         return
-    (tmp_path / "picture").write_bytes(picture.picture)
-    error = np.abs(read_rgb(tmp_path / "picture").astype(int) - rgb_from_i420(planes(exact)))
+    error = np.abs(picture.rgb.astype(int) - exact.rgb)
     assert error.mean() <= worst
 
 
@@ -191,7 +185,8 @@ def watch_command() -> Callable[..., Awaitable[list[str]]]:
     """Return a coroutine that watches in a thread, and the lines it printed."""
 
     async def run(address: object, **settings: Any) -> None:
-        await asyncio.to_thread(watch, WatchSettings(str(address), **settings))
+        with TwinClient(str(address)) as client:
+            await asyncio.to_thread(watch, WatchSettings(**settings), client)
 
     return run
 
@@ -254,7 +249,6 @@ async def test_a_server_that_refuses_a_watcher_is_one_clear_error(
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [
-        ({"address": "example.org:1"}, "not a loopback address"),
         ({"pictures": 0}, "pictures: 0 must be at least 1"),
         ({"video": Path("x.mp4"), "encoding": "jpeg"}, "jpeg makes no video"),
         ({"folder": Path("x"), "encoding": "none"}, "leaves nothing to keep"),
@@ -262,4 +256,10 @@ async def test_a_server_that_refuses_a_watcher_is_one_clear_error(
 )
 def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any], problem: str) -> None:
     with pytest.raises(InvalidInput, match=problem):
-        WatchSettings(**{"address": "127.0.0.1:1", **settings})
+        WatchSettings(**settings)
+
+
+def test_plaintext_to_another_machine_needs_permission() -> None:
+    with pytest.raises(InvalidInput, match="not a loopback address"):
+        TwinClient("example.org:1")
+    TwinClient("example.org:1", allow_insecure=True).close()

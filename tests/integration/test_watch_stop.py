@@ -17,11 +17,13 @@ import pytest
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.errors import RfedgeError
+from rfcore.wire import twin_client
 from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, twin_message_to_wire
+from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge import watch as module
 from rfedge.demo.processes import command_of
-from rfedge.watch import TwinWatcher, WatchSettings, watch_until_stopped
+from rfedge.watch import WatchSettings, watch_until_stopped
 
 DEPARTURE = twin_message_to_wire(Departure("cav-1", "front"))
 STARTED_S = 60.0
@@ -100,10 +102,10 @@ def test_a_watcher_ends_after_any_number_of_messages(
     """Stopped from another thread while messages stream in."""
     del repetition
     twin.enough_at = after
-    watcher = TwinWatcher(WatchSettings(address))
-    thread = in_thread(watcher.run)
+    client = TwinClient(address)
+    thread = in_thread(lambda: module.watch(WatchSettings(), client))
     assert (twin.watched if after == 0 else twin.enough).wait(STARTED_S)
-    watcher.stop()
+    client.stop()
     thread.join(STARTED_S)
     assert not thread.is_alive()
 
@@ -111,42 +113,42 @@ def test_a_watcher_ends_after_any_number_of_messages(
 @pytest.mark.parametrize("switches", [0, 1, 2, 4, 8, 16, 32, 64, 128, 256])
 def test_a_watcher_ends_at_any_point_of_its_start(address: str, switches: int) -> None:
     """Other threads run between the start and the stop: connecting, asking, the first messages."""
-    watcher = TwinWatcher(WatchSettings(address))
-    thread = in_thread(watcher.run)
+    client = TwinClient(address)
+    thread = in_thread(lambda: module.watch(WatchSettings(), client))
     for _ in range(64 * switches):
         os.sched_yield()
-    watcher.stop()
+    client.stop()
     thread.join(STARTED_S)
     assert not thread.is_alive()
 
 
 def test_a_watcher_that_was_stopped_before_it_ran_ends_at_once(address: str) -> None:
-    watcher = TwinWatcher(WatchSettings(address))
-    watcher.stop()
-    watcher.run()
+    client = TwinClient(address)
+    client.stop()
+    module.watch(WatchSettings(), client)
 
 
 def test_a_watcher_ends_while_it_waits_for_a_server_or_for_pictures(
     twin: EndlessTwin, address: str
 ) -> None:
     twin.idle = True
-    watching, waiting = TwinWatcher(WatchSettings(address)), TwinWatcher(NOBODY)
-    threads = [in_thread(watching.run), in_thread(waiting.run)]
+    clients = [TwinClient(address), TwinClient(NOWHERE)]
+    threads = [in_thread(lambda c=c: module.watch(WatchSettings(), c)) for c in clients]  # type: ignore[misc]
     assert twin.watched.wait(STARTED_S)
-    for watcher in (watching, waiting):
-        watcher.stop()
+    for client in clients:
+        client.stop()
     for thread in threads:
         thread.join(STARTED_S)
     assert not any(thread.is_alive() for thread in threads)
 
 
-NOBODY = WatchSettings("127.0.0.1:1")
+NOWHERE = "127.0.0.1:1"
 
 
 def test_without_a_server_the_error_names_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CONNECT_S", 0.05)
+    monkeypatch.setattr(twin_client, "CONNECT_S", 0.05)
     with pytest.raises(RfedgeError, match=r"no server at 127\.0\.0\.1:1 within 0\.05 s"):
-        module.watch(NOBODY)
+        module.watch(WatchSettings(), TwinClient(NOWHERE))
 
 
 @pytest.fixture
@@ -186,7 +188,7 @@ def test_a_signal_ends_the_watch_at_any_moment_with_a_whole_video(
         monkeypatch.setattr(module, "print", count, raising=False)
         teller = in_thread(tell)
         video = tmp_path / f"{repetition}.mp4"
-        watch_until_stopped(WatchSettings(address, video=video))
+        watch_until_stopped(WatchSettings(video=video), TwinClient(address))
         teller.join()
         with av.open(str(video)) as container:
             kept = len(list(container.decode(video=0)))
@@ -197,9 +199,9 @@ def test_a_signal_ends_the_watch_at_any_moment_with_a_whole_video(
 def test_an_error_of_the_watch_is_raised_where_it_was_called(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "CONNECT_S", 0.05)
+    monkeypatch.setattr(twin_client, "CONNECT_S", 0.05)
     with pytest.raises(RfedgeError, match="no server at"):
-        watch_until_stopped(NOBODY)
+        watch_until_stopped(WatchSettings(), TwinClient(NOWHERE))
 
 
 @contextmanager
@@ -223,6 +225,7 @@ def test_the_command_ends_while_it_watches(twin: EndlessTwin, address: str) -> N
 
 BLOCKED = """
 import sys, threading
+from rfcore.wire.twin_client import TwinClient
 from rfedge import watch
 
 def never(*values, **options):
@@ -231,7 +234,7 @@ def never(*values, **options):
     threading.Event().wait()
 
 watch.print, watch.FINISH_S = never, float(sys.argv[2])
-watch.watch_until_stopped(watch.WatchSettings(sys.argv[1]))
+watch.watch_until_stopped(watch.WatchSettings(), TwinClient(sys.argv[1]))
 """
 """A watcher that never gets a line printed, as when nobody reads its pipe."""
 

@@ -6,7 +6,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfedge.twin.board import Board, Message
+from rfedge.twin.scene import Board, Message
 
 KEYS = st.sampled_from("abc")
 STEPS = st.lists(

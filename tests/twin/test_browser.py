@@ -26,9 +26,8 @@ from rfcore.wire.address import Address
 from rfcore.wire.tiles import LearntLight, Tile, TileLight
 from rfedge.demo.processes import command_of, service
 from rfedge.samples import sample_path
-from rfedge.twin.board import Board
 from rfedge.twin.comparing import Comparer
-from rfedge.twin.scene import TwinScene
+from rfedge.twin.scene import Board, TwinScene
 from rfedge.twin.server_source import tile_rows
 from rfedge.twin.web import TwinWeb, WebSettings
 

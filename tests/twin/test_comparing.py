@@ -1,13 +1,14 @@
-"""Who is compared when: cameras take turns, and one that is looked at does not wait a second."""
+"""Cameras take turns to be compared; one that is looked at does not wait a second."""
 
 from concurrent.futures import Executor
 from dataclasses import replace
 from unittest.mock import Mock
 
 from rfcore.field import SplatField
-from rfedge.twin.board import Board
-from rfedge.twin.comparing import Comparer
-from rfedge.twin.scene import CameraKey, PlacedField, TwinScene
+from rfcore.image import rgb_from_bytes
+from rfcore.perception.objects import CameraKey
+from rfedge.twin.comparing import Comparer, compared
+from rfedge.twin.scene import Board, PlacedField, TwinScene
 from wall_scene import seen
 
 
@@ -77,3 +78,15 @@ def test_a_vehicle_that_is_lost_is_compared_with_nothing(wall: SplatField) -> No
     scene, comparer = street(wall)
     scene.show(replace(seen(wall), pose=None), 0.0)
     assert comparer.due(0.0) is None
+
+
+def test_a_picture_of_the_field_itself_is_close_and_its_difference_grey(wall: SplatField) -> None:
+    picture = seen(wall, object_level=250)
+    assert picture.pose is not None
+    same = compared(seen(wall), picture.pose, wall).header["psnr_db"]
+    assert same is None or same > 35  # JPEG loses little of a plain wall
+    render, difference = compared(picture, picture.pose, wall).parts
+    shown = rgb_from_bytes(difference, "difference").astype(int)
+    assert abs(shown[:8, :8].mean() - 128) < 3
+    assert shown[28:36, 44:68].min() > 200
+    assert rgb_from_bytes(render, "render").shape == shown.shape

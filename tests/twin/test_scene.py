@@ -5,8 +5,7 @@ from typing import Any
 
 from rfcore.camera import TileOrigin
 from rfcore.field import FieldMetadata, SplatField
-from rfedge.twin.board import Board, Reader
-from rfedge.twin.scene import PlacedField, TwinScene
+from rfedge.twin.scene import Board, PlacedField, Reader, TwinScene
 from wall_scene import seen, wall_field
 
 

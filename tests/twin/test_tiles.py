@@ -6,8 +6,7 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.tiles import LearntLight, Tile, TileLight, learnt_message, learnt_of
-from rfedge.twin.board import Board
-from rfedge.twin.scene import TwinScene
+from rfedge.twin.scene import Board, TwinScene
 from rfedge.twin.server_source import tile_rows
 
 OWN, DUSK, OLD = "a" * 64, "b" * 64, "c" * 64

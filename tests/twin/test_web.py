@@ -18,9 +18,8 @@ from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.wire.address import Address
 from rfcore.wire.twin_render import ViewRequest
-from rfedge.twin.board import Board, Message
 from rfedge.twin.comparing import Comparer
-from rfedge.twin.scene import PlacedField, TwinScene
+from rfedge.twin.scene import Board, Message, PlacedField, TwinScene
 from rfedge.twin.web import Look, Select, ShowObjects, TwinWeb, WebSettings, wish
 from wall_scene import seen
 
@@ -119,7 +118,7 @@ async def test_a_browser_is_sent_what_is_shown_and_what_comes(wall: SplatField) 
             made.scene.show(seen(wall), 0.0)
             data = await socket.receive_bytes(timeout=5)
             assert header_of(data)["vehicle"] == "cav-1"
-            assert data.endswith(seen(wall).jpeg)
+            assert data.endswith(seen(wall).picture)
         async with made.session.get(f"{made.url}splats/{wall.field_id}.spz") as response:
             assert await response.read() == b"splats"
         async with made.session.get(f"{made.url}splats/{'0' * 64}.spz") as response:

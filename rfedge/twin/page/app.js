@@ -74,7 +74,6 @@ const handlers = {
   },
   async comparison(header, parts) {
     const [shown, render, difference] = await Promise.all(parts.map(picture));
-    street.setMark(key(header), header);
     wall.setQuality(key(header), header);
     inspector.show(key(header), header, { shown, render, difference });
   },
@@ -129,7 +128,6 @@ setInterval(() => {
 }, 1000);
 element("overview").onclick = () => street.overview();
 element("follow").onchange = ({ target }) => { street.following = target.checked; };
-element("marks").onchange = ({ target }) => street.showMarks(target.checked);
 element("objects").onchange = showObjects;
 element("look").onclick = () => live.open();
 connect();

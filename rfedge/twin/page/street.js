@@ -1,11 +1,11 @@
-// The street in three dimensions: splats of every tile, cameras as frusta with their pictures, marks.
+// The street in three dimensions: splats of every tile, cameras as frusta with their pictures.
 // World axes are the field's: east, north, up, in metres. OpenCV cameras look along +z with y down,
 // three's along -z with y up: half a turn around x apart.
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
-const NEAR_M = 0.05, FAR_M = 5000, FRUSTUM_M = 1.5, MARK_S = 10;
+const NEAR_M = 0.05, FAR_M = 5000, FRUSTUM_M = 1.5;
 const PICTURES_EVERY_MS = 100;  // drawing splats costs far more than a picture is worth
 const DRAWING_SHARE = 0.2;  // of the time at most, for pictures alone
 const SLOW_MS = 400, QUICK_MS = 40, COARSEST = 0.25;  // fewer pixels while a drawing takes longer
@@ -22,8 +22,6 @@ export class Street {
     this.following = false;
     this.cameras = new Map();
     this.tiles = new Map();
-    this.marks = new Map();
-    this.marksShown = true;
     this.selected = null;
     this.frames = 0;
     this.drawn = 0;  // since the page was opened
@@ -65,8 +63,6 @@ export class Street {
 
   draw() {
     const now = performance.now();
-    for (const [key, mark] of this.marks)
-      if (now - mark.seen > 1000 * MARK_S) this.removeMark(key);
     const camera = this.following && this.cameras.get(this.selected);
     if (camera) this.lookAlong(camera);
     else if (!this.fixedSize) this.controls.update();
@@ -240,7 +236,6 @@ export class Street {
       camera.group.traverse((part) => { part.geometry?.dispose(); part.material?.dispose(); });
       this.cameras.delete(key);
     }
-    this.removeMark(key);
     this.touchLater();
   }
 
@@ -248,35 +243,6 @@ export class Street {
     this.selected = key && key.join("/");
     for (const [name, camera] of this.cameras)
       camera.material.color.set(name === this.selected ? 0xf0883e : 0x58a6ff);
-    this.touch();
-  }
-
-  setMark(key, header) {
-    this.removeMark(key);
-    if (!header.mark) return;
-    const radius = Math.max(0.2, header.mark.width_m / 2);
-    const ring = new THREE.Mesh(new THREE.TorusGeometry(radius, 0.05, 8, 48),
-      new THREE.MeshBasicMaterial({ color: 0xf85149 }));
-    ring.position.copy(vector(header.mark.position_m)).add(vector(header.origin_m));
-    ring.visible = this.marksShown;
-    this.marks.set(key, { ring, seen: performance.now() });
-    this.scene.add(ring);
-    this.touchLater();
-  }
-
-  removeMark(key) {
-    const mark = this.marks.get(key);
-    if (!mark) return;
-    this.scene.remove(mark.ring);
-    mark.ring.geometry.dispose();
-    mark.ring.material.dispose();
-    this.marks.delete(key);
-    this.touchLater();
-  }
-
-  showMarks(shown) {
-    this.marksShown = shown;
-    for (const { ring } of this.marks.values()) ring.visible = shown;
     this.touch();
   }
 
@@ -298,7 +264,6 @@ export class Street {
   fix(pose) {
     this.fixedSize = pose !== null;
     for (const { group } of this.cameras.values()) group.visible = !this.fixedSize;
-    this.showMarks(!this.fixedSize);
     if (!pose) { this.resize(); return; }
     const { translation_m, rotation_wxyz, intrinsics: k } = pose;
     this.size = null;

@@ -1,0 +1,239 @@
+"""Clients of a server's twin: pictures as they are reconstructed, objects, and rendered views.
+
+``TwinClient`` is for threads, ``AsyncTwinClient`` for an event loop. Both connect to one server,
+in plaintext only on this machine unless that is allowed. What goes wrong is an ``RfedgeError``:
+``AccessDenied`` where waiting does not help, ``ProtocolError`` for an impossible answer.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import AsyncIterator, Callable, Generator
+from types import TracebackType
+
+import grpc
+
+from rfcore.errors import AccessDenied, RfedgeError
+from rfcore.wire.address import Address, check_handshake
+from rfcore.wire.conventions import CONSUMER_OPTIONS
+from rfcore.wire.tls import TlsFiles
+from rfcore.wire.twin import (
+    Departure,
+    Subscription,
+    TwinPicture,
+    subscription_to_wire,
+    twin_message_from_wire,
+)
+from rfcore.wire.twin_render import (
+    ObjectsRequest,
+    ObjectsSeen,
+    RenderedView,
+    ViewRequest,
+    objects_from_wire,
+    objects_request_to_wire,
+    rendered_view_from_wire,
+    view_request_to_wire,
+)
+from rfcore.wire.v1 import twin_pb2_grpc
+
+__all__ = ["AsyncTwinClient", "TwinClient", "twin_error"]
+
+CONNECT_S = 10.0
+RENDER_TIMEOUT_S = 30.0
+REFUSED = (
+    grpc.StatusCode.PERMISSION_DENIED,
+    grpc.StatusCode.UNAUTHENTICATED,
+    grpc.StatusCode.UNIMPLEMENTED,
+)
+"""Statuses that do not pass by waiting."""
+
+
+def twin_error(error: grpc.RpcError) -> RfedgeError:
+    """Return a failed call as one of our errors."""
+    if not isinstance(error, grpc.Call | grpc.aio.AioRpcError):
+        return RfedgeError(str(error))
+    kind = AccessDenied if error.code() in REFUSED else RfedgeError
+    return kind(f"{error.code().name.lower()}: {error.details()}")
+
+
+class TwinClient:
+    """Watches one server's twin and asks it for views; for threads.
+
+    >>> with TwinClient("127.0.0.1:50051") as twin:  # doctest: +SKIP
+    ...     for message in twin.watch(Subscription(encoding=PictureEncoding.I420)):
+    ...         if isinstance(message, TwinPicture):
+    ...             print(message.vehicle_id, message.sequence, message.rgb.shape)
+
+    Raises ``InvalidInput`` for an address that is none, and for plaintext to another machine unless
+    ``allow_insecure``.
+    """
+
+    def __init__(
+        self, address: str, tls: TlsFiles | None = None, *, allow_insecure: bool = False
+    ) -> None:
+        self.address = _checked(address, tls, allow_insecure)
+        self._tls = tls
+        self._channel = _channel(self.address, tls)
+        self._lock = threading.Lock()
+        self._stopped = False
+        self._call: grpc.Call | None = None
+
+    def __enter__(self) -> TwinClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._channel.close()
+
+    def watch(
+        self,
+        subscription: Subscription | None = None,
+        connected: Callable[[], None] = lambda: None,
+    ) -> Generator[TwinPicture | Departure, None, None]:
+        """Yield pictures and departures until the server ends the stream, or ``stop``.
+
+        The newest picture of each camera comes first; a reader that is slow misses pictures. By
+        default pictures of all vehicles come, as JPEG. ``connected`` is called when the server has
+        accepted the call. Raises ``RfedgeError`` if no server answers within ``CONNECT_S``.
+        """
+        request = subscription_to_wire(subscription or Subscription())
+        stub = twin_pb2_grpc.TwinServiceStub(self._channel)
+        with self._lock:
+            if self._stopped:
+                return
+            self._call = call = stub.Watch(request, wait_for_ready=True)
+        try:
+            self._wait_for_server(call)
+            connected()
+            for response in call:
+                if self._stopped:
+                    return
+                yield twin_message_from_wire(response)
+        except grpc.RpcError as error:
+            if not self._stopped:
+                raise twin_error(error) from error
+        finally:
+            call.cancel()
+
+    def stop(self) -> None:
+        """End ``watch``; may be called from any thread, and before ``watch``."""
+        with self._lock:
+            self._stopped = True
+            if self._call is not None:
+                self._call.cancel()
+
+    def render(self, request: ViewRequest) -> RenderedView:
+        """Return the street as it is from one viewpoint."""
+        stub = twin_pb2_grpc.TwinServiceStub(self._channel)
+        try:
+            answer = stub.Render(view_request_to_wire(request), timeout=RENDER_TIMEOUT_S)
+        except grpc.RpcError as error:
+            raise twin_error(error) from error
+        return rendered_view_from_wire(answer, request.camera.intrinsics)
+
+    def _wait_for_server(self, call: grpc.Call) -> None:
+        """Wait until the server answers, or the call is cancelled; raise ``RfedgeError``."""
+        expired = threading.Event()
+
+        def expire() -> None:
+            expired.set()
+            call.cancel()
+
+        timer = threading.Timer(CONNECT_S, expire)
+        timer.start()
+        try:
+            call.initial_metadata()
+        finally:
+            timer.cancel()
+        if expired.is_set() and not self._stopped:
+            check_handshake(self.address, self._tls)
+            raise RfedgeError(f"no server at {self.address} within {CONNECT_S:g} s")
+
+
+class AsyncTwinClient:
+    """The same for an event loop; connected inside of ``async with``.
+
+    Waits for a server that is not there yet. Raises as ``TwinClient`` does.
+    """
+
+    def __init__(
+        self, address: str, tls: TlsFiles | None = None, *, allow_insecure: bool = False
+    ) -> None:
+        self.address = _checked(address, tls, allow_insecure)
+        self._tls = tls
+        self._channel: grpc.aio.Channel | None = None
+
+    async def __aenter__(self) -> AsyncTwinClient:
+        options, address = CONSUMER_OPTIONS, str(self.address)
+        if self._tls is None:
+            self._channel = grpc.aio.insecure_channel(address, options=options)
+        else:
+            credentials = self._tls.channel_credentials()
+            self._channel = grpc.aio.secure_channel(address, credentials, options=options)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            await channel.close()
+
+    @property
+    def channel(self) -> grpc.aio.Channel:
+        """The connection, for the server's other services; raises ``RfedgeError`` if closed."""
+        if self._channel is None:
+            raise RfedgeError("there is no connection to the server")
+        return self._channel
+
+    async def watch(
+        self,
+        subscription: Subscription | None = None,
+        connected: Callable[[], None] = lambda: None,
+    ) -> AsyncIterator[TwinPicture | Departure]:
+        """Yield pictures and departures until the server ends the stream.
+
+        ``connected`` is called when the server has accepted the call.
+        """
+        request = subscription_to_wire(subscription or Subscription())
+        stub = twin_pb2_grpc.TwinServiceStub(self.channel)
+        call = stub.Watch(request, wait_for_ready=True)
+        try:
+            await call.initial_metadata()
+            connected()
+            async for response in call:
+                yield twin_message_from_wire(response)
+        except grpc.aio.AioRpcError as error:
+            raise twin_error(error) from error
+        finally:
+            call.cancel()
+
+    async def objects(self, request: ObjectsRequest) -> AsyncIterator[ObjectsSeen]:
+        """Yield what stands on the ground of a tile and is not in its field, with each picture."""
+        call = twin_pb2_grpc.TwinServiceStub(self.channel).Objects(objects_request_to_wire(request))
+        try:
+            async for response in call:
+                yield objects_from_wire(response)
+        except grpc.aio.AioRpcError as error:
+            raise twin_error(error) from error
+        finally:
+            call.cancel()
+
+
+def _checked(address: str, tls: TlsFiles | None, allow_insecure: bool) -> Address:
+    parsed = Address.parse("address", address)
+    if tls is None:
+        parsed.require_private("address", allow_insecure)
+    return parsed
+
+
+def _channel(address: Address, tls: TlsFiles | None) -> grpc.Channel:
+    if tls is None:
+        return grpc.insecure_channel(str(address), options=CONSUMER_OPTIONS)
+    return grpc.secure_channel(str(address), tls.channel_credentials(), options=CONSUMER_OPTIONS)
