@@ -37,7 +37,7 @@ test-slow: build-full test-system-packages  ## run the tests that take more than
 	$(BIN)/python -m pytest -m "slow and not compose and not fault and not attack and not nightly" $(PARALLEL) --timeout 600
 
 test-slices: build-full  ## compare a million macroblocks of the slice coder with FFmpeg; fuzz it and packets
-	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py tests/bench/test_fuzz.py -m nightly --timeout 1800
+	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py tests/codec/test_mutations.py -m nightly --timeout 1800
 
 test-scale: build-full  ## run each case of `rfedge-lab scale` once, small: Envoy, NATS, servers, their vehicles
 	$(BIN)/python -m pytest tests/integration/test_envoy.py tests/integration/test_nats.py -m nightly --timeout 600

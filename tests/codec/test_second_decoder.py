@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from codec.sent_streams import make_stream
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import REFERENCE_FRAMES, CodecConfig
 from rfcore.codec.h264.header import own_header
 from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, SliceCoder
 from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.image import I420
-from rfedge.bench.fuzz import make_stream
 
 NEEDED = ("gst-launch-1.0", "gst-inspect-1.0")
 PICTURES = 8 + (1 + 1 + 1 + 3 + 3 + 2 + 2 + 1)

@@ -1,15 +1,16 @@
 """Write delta_packets.npz: a frame of every kind as it goes over the wire, what decodes it.
 
-python tests/data/make_delta_packets.py; only when the packet or the codec's arithmetic must change.
+Run ``PYTHONPATH=tests python tests/data/make_delta_packets.py`` only when the packet or the
+codec's arithmetic must change.
 """
 
 from pathlib import Path
 
 import numpy as np
 
+from codec.sent_streams import make_stream
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
-from rfedge.bench.fuzz import make_stream
 
 OUT = Path(__file__).with_name("delta_packets.npz")
 

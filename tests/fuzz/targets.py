@@ -115,9 +115,10 @@ class Receiver:
     next_packet: DeltaPacket
 
     def takes(self, packet: DeltaPacket) -> None:
-        """Decode a packet, or refuse it."""
+        """Decode a packet to the picture it promises, or refuse it."""
         with suppress(PacketRejected):
-            self.decoder.decode(self.state, packet, self.view)
+            decoded = self.decoder.decode(self.state, packet, self.view)
+            assert decoded.frame.digest() == packet.reconstruction_digest
 
 
 @cache
