@@ -11,7 +11,7 @@ BUILT  := $(VENV)/.built
 LOCKED ?= 1
 # A package index with CPU builds of PyTorch, for those whose default index brings CUDA packages.
 TORCH_INDEX ?=
-# Pythons that `make wheels` builds for: all that are found, unless named.
+# Pythons that `make wheels` and `make test-wheels` use: all that are found, unless named.
 PYTHONS ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
@@ -263,10 +263,10 @@ lock: $(DEMO)  ## pin versions and hashes anew in requirements/ (Python 3.11)
 	$(BIN)/python -m pip install -q "pip-tools>=7.5"
 	PYTHON=$(BIN)/python deploy/lock.sh
 
-wheels:  ## build a manylinux wheel for each CPython from 3.11 to 3.13 that is found, into dist/
+wheels:  ## build the manylinux wheels into dist/: one for CPython 3.11, one for 3.12 and later
 	$(PYTHON) deploy/wheels.py build $(PYTHONS)
 
-test-wheels: wheels  ## install each into an empty venv, run the demo, compare what it encodes
+test-wheels: wheels  ## try each CPython that is found in an empty venv: demo, and the bytes it encodes
 	$(PYTHON) deploy/wheels.py test $(PYTHONS)
 
 # The stubs are committed, so that installing needs no protoc; tests/wire/test_stubs.py sees drift.

