@@ -20,9 +20,9 @@ from dataclasses import field as with_factory
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
+from rfcore.dataset.mounts import mounts_named
 from rfcore.errors import InvalidInput
 from rfcore.tables import Range, Table
-from rfedge.datasets.rig import mounts_named
 from rfedge.samples import sample_path
 from streetgen.effects import EFFECTS, EffectKind, load_effect
 from streetgen.geometry.layout import Geometry
@@ -169,7 +169,7 @@ class Drive:
     lane_offset_m: Annotated[float, LANE_OFFSET_M] = 0.0
     size_px: Size = (640, 360)
     rig: str = "mid_front,mid_left,mid_right,mid_back"
-    """Which of the car's cameras take the split ``rig`` (``rfedge.datasets.rig``), or all."""
+    """Which of the car's cameras take the split ``rig`` (``rfcore.dataset.mounts``), or all."""
 
     @property
     def frames(self) -> int:

@@ -17,8 +17,8 @@ from enum import StrEnum
 import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.dataset.mounts import RIG, mounts_named
 from rfcore.errors import InvalidInput
-from rfedge.datasets.rig import RIG, mounts_named
 from streetgen.geometry.layout import Layout
 from streetgen.scene_file import Scene
 from streetgen.trajectory import (

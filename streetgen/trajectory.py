@@ -14,8 +14,8 @@ from functools import partial
 import numpy as np
 
 from rfcore.camera import Pose
+from rfcore.dataset.mounts import Mount
 from rfcore.motion import quaternion_from_vector, rotation_vector
-from rfedge.datasets.rig import Mount
 from streetgen.geometry.layout import LANE_M
 from streetgen.geometry.mesh import F64
 from streetgen.scene_file import Drive, LocalisationNoise

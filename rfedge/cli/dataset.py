@@ -245,11 +245,11 @@ class DatasetRecordCarla:
 
     def run(self) -> None:
         """Connect, record, and write the dataset."""
+        from rfcore.dataset.mounts import mounts_named
         from rfcore.errors import RfedgeError
         from rfcore.extras import needs
         from rfcore.files import whole_folder
         from rfedge.datasets.carla import Recorder, RecordSettings
-        from rfedge.datasets.rig import mounts_named
 
         settings = RecordSettings(
             spawn=self.spawn,

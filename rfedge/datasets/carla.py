@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 
 from rfcore.camera import Intrinsics, Pose
+from rfcore.dataset.mounts import RIG, Mount
 from rfcore.dataset.source import SourceCamera
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import write_png
-from rfedge.datasets.rig import RIG, Mount
 
 __all__ = ["RecordSettings", "Recorder", "intrinsics_of_fov", "point_from_carla", "pose_from_carla"]
 

@@ -24,13 +24,13 @@ import numpy as np
 import streetgen
 from rfcore.camera import Pose
 from rfcore.dataset import write_manifest
+from rfcore.dataset.mounts import mounts_named
 from rfcore.dataset.rig import RIG_FILE, Rig, RigCamera, write_rig
 from rfcore.dataset.source import SourceCamera, SourcePoints, read_points
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.lens import LensCamera
-from rfedge.datasets.rig import mounts_named
 from streetgen.build.scene_renderer import RenderJob, ShotFiles, camera_of_pictures
 from streetgen.scene_file import Scene
 from streetgen.shots import Shot, Split, shots_of, thinned_indices

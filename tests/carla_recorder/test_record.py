@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from rfcore.dataset import read_dataset
+from rfcore.dataset.mounts import RIG, mounts_named
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.carla import Recorder, RecordSettings
-from rfedge.datasets.rig import RIG, mounts_named
 
 SMALL = RecordSettings(stations=3, spacing_m=5.0, size_px=(32, 18), timeout_s=0.2)
 

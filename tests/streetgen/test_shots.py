@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Pose
+from rfcore.dataset.mounts import RIG
 from rfcore.errors import InvalidInput
-from rfedge.datasets.rig import RIG
 from streetgen import load_scene
 from streetgen.scene_file import Drive, LocalisationNoise, Rig, Scene
 from streetgen.shots import Selection, Shot, Split, shots_of, thinned_indices

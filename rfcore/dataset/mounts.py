@@ -1,9 +1,9 @@
-"""The rig: 18 cameras on a car.
+"""Where a car carries its cameras: 18 places, which the CARLA recorder and streetgen both use.
 
-The published method names the number of cameras, not their places. These are three rows of six, the
-heights, reach and tilts after the authors' later recorder (Maftej/rfdvc): low before the bumper and
-tilted up, at roof height and level, high and tilted down; each row looks to the front, 45 degrees
-to either side, to both sides and back.
+The published method names the number of cameras, not their places. These are three rows of six.
+Heights, reach and tilts follow the authors' later recorder (Maftej/rfdvc): low before the bumper
+and tilted up, at roof height and level, high and tilted down. Each row looks to the front, 45
+degrees to either side, to both sides and back.
 """
 
 from __future__ import annotations
