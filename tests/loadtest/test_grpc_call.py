@@ -5,12 +5,14 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 
 import grpc
 import pytest
+from h2.config import H2Configuration
+from h2.connection import H2Connection
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.errors import ProtocolError
 from rfcore.wire.conventions import SERVER_OPTIONS
-from rfedge.loadtest.grpc_call import GrpcCall, Status
+from rfedge.loadtest.grpc_call import CALL, GrpcCall, Status
 
 METHOD = "/test.Echo/Stream"
 Context = grpc.aio.ServicerContext
@@ -67,21 +69,24 @@ async def test_the_servers_status_and_its_text_arrive(code: grpc.StatusCode, det
     assert call.status == Status(code.value[0], details)
 
 
-def server_bytes(*messages: bytes) -> bytes:
-    """What a server writes for messages: SETTINGS, then each in a DATA frame."""
-    settings = bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
-    frames = (
-        len(body).to_bytes(3, "big") + bytes([0, 0, 0, 0, 0, 1]) + body
-        for body in (b"\0" + len(m).to_bytes(4, "big") + m for m in messages)
-    )
-    return settings + b"".join(frames)
+def server_of(call: GrpcCall) -> H2Connection:
+    """Return the server's end of the call's connection, which has answered with its headers."""
+    server = H2Connection(H2Configuration(client_side=False))
+    server.initiate_connection()
+    server.receive_data(call.data_to_send())
+    server.send_headers(CALL, ((":status", "200"), ("content-type", "application/grpc")))
+    return server
 
 
 @given(st.lists(st.binary(max_size=50), max_size=5), st.lists(st.integers(1, 40), max_size=40))
 def test_it_does_not_matter_how_the_socket_cuts_the_bytes(
     messages: list[bytes], cuts: list[int]
 ) -> None:
-    data, call, received = server_bytes(*messages), GrpcCall("a", METHOD), list[bytes]()
+    call, received = GrpcCall("a", METHOD), list[bytes]()
+    server = server_of(call)
+    for message in messages:
+        server.send_data(CALL, b"\0" + len(message).to_bytes(4, "big") + message)
+    data = server.data_to_send()
     for cut in cuts:
         part, data = data[:cut], data[cut:]
         received += call.receive(part)
@@ -90,23 +95,37 @@ def test_it_does_not_matter_how_the_socket_cuts_the_bytes(
 
 def test_what_the_server_has_no_window_for_waits() -> None:
     call = GrpcCall("a", METHOD)
-    call.data_to_send()
+    server = server_of(call)
     call.send(bytes(70_000))
     assert call.is_blocked
-    sent = len(call.data_to_send())
-    widen = b"".join(
-        bytes([0, 0, 4, 8, 0]) + stream.to_bytes(4, "big") + (10_000).to_bytes(4, "big")
-        for stream in (0, 1)
-    )
-    call.receive(widen)
+    server.receive_data(call.data_to_send())
+    server.acknowledge_received_data(65_535, CALL)
+    call.receive(server.data_to_send())
     assert not call.is_blocked
-    rest = len(call.data_to_send())
-    heads = 5 * 9  # 65535 bytes take four frames of at most 16384, the rest another
-    assert sent + rest == 5 + 70_000 + heads
 
 
 def test_a_compressed_message_is_refused() -> None:
-    body = b"\1" + (1).to_bytes(4, "big") + b"x"
-    frame = len(body).to_bytes(3, "big") + bytes([0, 0, 0, 0, 0, 1]) + body
+    call = GrpcCall("a", METHOD)
+    server = server_of(call)
+    server.send_data(CALL, b"\1" + (1).to_bytes(4, "big") + b"x")
     with pytest.raises(ProtocolError, match="compressed"):
-        GrpcCall("a", METHOD).receive(frame)
+        call.receive(server.data_to_send())
+
+
+def test_a_server_that_goes_away_or_resets_the_stream_ends_the_call() -> None:
+    away, reset = GrpcCall("a", METHOD), GrpcCall("a", METHOD)
+    leaving, resetting = server_of(away), server_of(reset)
+    leaving.close_connection(additional_data=b"maintenance")
+    away.receive(leaving.data_to_send())
+    assert away.status == Status(14, "connection closed by the server: maintenance")
+    resetting.reset_stream(CALL, 8)
+    reset.receive(resetting.data_to_send())
+    assert reset.status == Status(13, "stream reset, HTTP/2 error 8")
+    for call in (away, reset):
+        call.send(b"too late")
+
+
+def test_what_is_not_http2_is_refused() -> None:
+    data_of_a_stream_that_nobody_opened = bytes([0, 0, 1, 0, 0, 0, 0, 0, 3]) + b"x"
+    with pytest.raises(ProtocolError, match="HTTP/2"):
+        GrpcCall("a", METHOD).receive(data_of_a_stream_that_nobody_opened)
