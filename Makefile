@@ -18,7 +18,7 @@ NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 .DEFAULT_GOAL := help
 .PHONY: help demo sample sample-field test test-slow test-slices test-scale test-aarch64 test-prometheus test-netns test-fault test-attack \
 	test-compose test-system-packages drive-long stability check build bench proto figures images up \
-	down load load-transport load-receiver load-full load-links load-overload load-ratio soak soak-short \
+	down load load-transport load-receiver load-full load-links load-overload soak soak-short \
 	docs test-wheels build-full results results-full lock wheels nightly test-asan fuzz fuzz-nightly test-fault-core sizing
 
 help:  ## show the targets
@@ -142,24 +142,21 @@ down:  ## stop them and remove their volumes
 	$(COMPOSE) $(COMPOSE_FILES) down -v
 
 RUNS ?= 3
-LOADTEST = $(BIN)/rfedge loadtest --record lab/results/loadtest.json --runs $(RUNS)
+# A load NAME with OPTIONS: what was measured is recorded whether it was held or not.
+load = rm -f out/loadtest/$(1)/result.json; \
+	$(BIN)/rfedge loadtest --runs $(RUNS) --out out/loadtest/$(1) $(2); ended=$$?; \
+	$(BIN)/python -m lab.pages.loads lab/results/loadtest.json out/loadtest/$(1)/result.json && exit $$ended
 load: load-transport load-receiver load-full load-links load-overload  ## what two cores carry (`make -k load`, 8 min); writes lab/results/loadtest.json
 load-transport: build-full  ## 100 streams at 30 Hz, pictures not decoded; writes lab/results/loadtest.json
-	$(LOADTEST) --mode transport --vehicles 100 --hz 30 --out out/loadtest/transport
+	$(call load,transport,--mode transport --vehicles 100 --hz 30)
 load-receiver: build-full  ## 8 vehicles at 10 Hz, decoded against cached renders; writes lab/results/loadtest.json
-	$(LOADTEST) --mode receiver --vehicles 8 --hz 10 --out out/loadtest/receiver
+	$(call load,receiver,--mode receiver --vehicles 8 --hz 10)
 load-full: build-full  ## 8 vehicles at 10 Hz, rendered and decoded; writes lab/results/loadtest.json
-	$(LOADTEST) --mode full --vehicles 8 --hz 10 --out out/loadtest/full
+	$(call load,full,--mode full --vehicles 8 --hz 10)
 load-links: build-full  ## 8 vehicles, each on a recorded link of its own; writes lab/results/loadtest.json
-	$(LOADTEST) --mode receiver --vehicles 8 --hz 5 --link samples/links/drive.toml \
-		--out out/loadtest/links
+	$(call load,links,--mode receiver --vehicles 8 --hz 5 --link samples/links/drive.toml)
 load-overload: build-full  ## twice of that load-full, admission on; writes lab/results/loadtest.json
-	$(LOADTEST) --mode full --vehicles 16 --hz 10 --admission --out out/loadtest/overload
-
-# The revision whose figures lab/results/loadtest.json had when the server was reworked for isolation.
-BASE ?= 83ce11fb3ba2
-load-ratio: build-full  ## vehicles that the full loop carries now and at BASE, in turn, 3 runs each (10 min); writes lab/results/load-ratio.json
-	$(BIN)/python tests/loadtest/limit_ratio.py $(BASE) lab/results/load-ratio.json
+	$(call load,overload,--mode full --vehicles 16 --hz 10 --admission)
 
 MINUTES ?= 30
 soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads must not grow; writes lab/results/soak.json

@@ -24,12 +24,20 @@ import tyro
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.run import Run, TestBed, run_load
-from rfedge.loadtest.usage import Sample, slope_per_minute
+from rfedge.loadtest.usage import Sample
 from rfedge.report.tables import cell, heading, table
 from rfedge.results import Result, make_result, provenance, rows_of, write_result
 from rfedge.samples import sample_path
 
-__all__ = ["MAX_SLOPE_MB", "SoakRow", "SoakSettings", "soak", "soak_section", "what_grew"]
+__all__ = [
+    "MAX_SLOPE_MB",
+    "SoakRow",
+    "SoakSettings",
+    "slope_per_minute",
+    "soak",
+    "soak_section",
+    "what_grew",
+]
 
 Amount = TypeVar("Amount", int, float)
 
@@ -134,6 +142,18 @@ def what_grew(samples: Sequence[Sample]) -> list[str]:
         if least[-1] > least[0] and (steadily or not late_pool):
             problems.append(f"{name} grew from {least[0]} to {least[-1]}")
     return problems
+
+
+def slope_per_minute(samples: Sequence[Sample]) -> float:
+    """Return the least-squares slope of memory in MB per minute."""
+    if len(samples) < 2:
+        return 0.0
+    minutes = [(s.at_s - samples[0].at_s) / 60 for s in samples]
+    mean_t = sum(minutes) / len(minutes)
+    mean_mb = sum(s.rss_mb for s in samples) / len(samples)
+    spread = sum((t - mean_t) ** 2 for t in minutes)
+    pairs = zip(minutes, samples, strict=True)
+    return sum((t - mean_t) * (s.rss_mb - mean_mb) for t, s in pairs) / spread if spread else 0.0
 
 
 COUNTED: tuple[tuple[str, Callable[[Sample], int]], ...] = (

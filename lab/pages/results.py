@@ -16,6 +16,8 @@ from lab.classes.measure import classes_section
 from lab.latency.report import latency_section, write_latency_figures
 from lab.live.report import live_section
 from lab.localisation.rows import localise_section
+from lab.pages.demo import demo_section
+from lab.pages.loads import load_section, ratio_section
 from lab.paper.figures import write_paper_figures
 from lab.paper.report import paper_rows, paper_section
 from lab.rig.report import rig_section
@@ -25,12 +27,10 @@ from lab.soak import soak_section
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfedge.bench import bench_section
-from rfedge.demo.report import demo_section
 from rfedge.evaluate.compare.figures import write_bd_rates, write_compare_figures
 from rfedge.evaluate.compare.report import compare_section, harder_sentence, headline
 from rfedge.evaluate.ladder.page import write_ladder_figure
 from rfedge.evaluate.never_worse.measure import never_worse_section
-from rfedge.loadtest.result import load_section, ratio_section
 from rfedge.report.tables import heading, plain_section
 from rfedge.results import Result, read_result
 from rfedge.training.report import training_section

@@ -8,6 +8,7 @@ python -m lab.pages.sizing city    # the table that stands in docs/how-to/server
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Sequence
 from io import StringIO
 
 from rich.console import Console
@@ -17,10 +18,17 @@ from lab.city.flow import costs_of
 from lab.city.plan import plan_city
 from lab.city.traffic import stated_traffic
 from rfedge.report.tables import table
-from rfedge.results import Result, read_result
+from rfedge.results import Result, read_result, rows_of
 from rfedge.sizing.estimate import Demand, estimate
-from rfedge.sizing.report import print_sizing, tables_page
-from rfedge.sizing.tables import MAX_BEYOND_DB, MAX_BEYOND_FACTOR, SHIPPED, read_tables
+from rfedge.sizing.report import print_sizing
+from rfedge.sizing.tables import (
+    CODECS,
+    MAX_BEYOND_DB,
+    MAX_BEYOND_FACTOR,
+    SHIPPED,
+    SizingCell,
+    read_tables,
+)
 
 __all__ = ["CITY_MARK", "city_table", "sizing_page"]
 
@@ -109,8 +117,41 @@ def sizing_page(result: Result) -> str:
         measured_on=str(result["measured_on"]).capitalize(),
         revision=str(result["revision"])[:12],
         cpu=result["host"]["cpu"],
-        table=tables_page(result),
+        table=_tables(result),
     )
+
+
+PAGE_DB = (32.0, 34.0, 36.0)
+
+
+def _tables(result: Result) -> str:
+    cells = rows_of(SizingCell, result["cells"])
+    lines = ["| size | Hz | frames | codec | " + " | ".join(f"{db:g} dB" for db in PAGE_DB)]
+    lines[0] += " | sender | receiver |"
+    lines.append("|---|---|---|---|" + "---|" * (len(PAGE_DB) + 2))
+    lines += _page_rows(sorted(cells, key=lambda c: (c.pixels, c.hz, CODECS.index(c.codec))))
+    return "\n".join(lines) + "\n"
+
+
+def _page_rows(cells: Sequence[SizingCell]) -> Iterator[str]:
+    for cell in cells:
+        sizes = " | ".join(_kbit_s(cell, db) for db in PAGE_DB)
+        yield (
+            f"| {cell.width_px}x{cell.height_px} | {cell.hz:.3g} | {cell.frames} | {cell.codec} | "
+            f"{sizes} | {cell.sender_ms:.1f} | {cell.receiver_ms:.1f} |"
+        )
+
+
+def _kbit_s(cell: SizingCell, db: float) -> str:
+    """Return kbit/s with the interval, n/a where the cell does not reach the quality."""
+    if db not in cell.psnr_db:
+        return "n/a"
+    at = list(cell.psnr_db).index(db)
+    low, mean, high = (
+        column[at] * 8e-3 * cell.hz
+        for column in (cell.low_bytes, cell.bytes_per_frame, cell.high_bytes)
+    )
+    return f"{mean:.0f} ({low:.0f}..{high:.0f})"
 
 
 CITY_MARK = "<!-- made by: python -m lab.pages.sizing city -->"

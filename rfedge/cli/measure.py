@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, RENDERER, field_path
+from rfedge.arguments import DATASET, FIELD, FOLDER, RENDERER, field_path
 from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.ladder import EvalLadder
 from rfedge.evaluate.never_worse import EvalNeverWorse
@@ -95,18 +95,18 @@ class LoadTest:
     renderer: Annotated[str, RENDERER] = "cpu"
     """What the server of --mode full draws with, and vehicles that are --live."""
     out: Annotated[Path, FOLDER] = Path("out/loadtest")
-    """Folder for report.html, result.json and vehicles_vs_uplink.svg."""
+    """Folder for report.html and result.json."""
     cache: Annotated[Path, FOLDER] = Path("out/cache/loadtest")
     """Folder that keeps coded drives between runs."""
-    record: Annotated[Path | None, JSON] = None
-    """Also put the rows into this result file, in place of those of the same load."""
 
     def run(self) -> None:
         """Run, write the report, print the rows; fail if the asked number is not held."""
+        from rich.console import Console
+
         from rfcore.errors import InvalidInput, RfedgeError
         from rfcore.wire.settings import RenderSettings
         from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
-        from rfedge.loadtest.result import Command
+        from rfedge.loadtest.result import print_runs, run_loads, write_load_result
         from rfedge.loadtest.run import TestBed
 
         if not 1 <= self.runs <= 100 or (self.find_limit and self.runs > 1):
@@ -129,9 +129,11 @@ class LoadTest:
         bed = TestBed(
             field_path(self.field), self.drive, self.workers, self.cache, self.out / "work"
         )
-        result = Command(load, bed, self.out, self.record).run(
-            find_limit=self.find_limit, repeated=self.runs
-        )
+        console = Console()
+        result = run_loads(load, bed, console, find_limit=self.find_limit, repeated=self.runs)
+        write_load_result(result, self.out)
+        print_runs(console, result)
+        console.print(f"  {self.out / 'report.html'}\n  {self.out / 'result.json'}")
         broken = [problem for run in result.runs for problem in run.verdict.broken]
         if not self.find_limit and broken:
             raise RfedgeError("not held: " + "; ".join(broken))

@@ -75,6 +75,6 @@ class Size:
             raise InvalidInput("drive", "give --drive and --field together, or neither")
         if self.drive is None or self.field is None:
             return shipped_tables()
-        from rfedge.sizing.run import own_tables
+        from rfedge.sizing.measure import own_tables
 
         return own_tables(self.drive, field_path(self.field), demand, self.frames, self.cells)

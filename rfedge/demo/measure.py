@@ -212,9 +212,9 @@ class DriveFigures:
     stage_ms: Mapping[str, float]
     """Medians."""
     per_frame: Sequence[FrameFigures]
-    saving_vs_x264_percent: float | None = None
-    """At equal PSNR against low-delay x264; None in results from before it was measured."""
-    x264_setting: str | None = None
+    saving_vs_x264_percent: float
+    """At equal PSNR against low-delay x264."""
+    x264_setting: str
 
 
 def measure_drive(outcome: DriveOutcome) -> DriveFigures:

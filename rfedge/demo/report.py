@@ -1,6 +1,6 @@
 """The report of a demo: one HTML file with tables, charts and pictures.
 
-Its tables are also what the terminal and the results page show of the same ``result.json``.
+The terminal shows the summary of the same ``result.json``.
 """
 
 from __future__ import annotations
@@ -25,14 +25,11 @@ from rfedge.report.charts import (
     quality_chart,
     stages_chart,
 )
-from rfedge.report.tables import heading
-from rfedge.report.tables import table as markdown_table
 from rfedge.results import Result, as_json, rows_of
 
 __all__ = [
     "METRIC",
     "SUMMARY",
-    "demo_section",
     "figures_of",
     "print_summary",
     "write_report",
@@ -59,16 +56,11 @@ def _latency(drive: DriveFigures) -> str:
     return f"{drive.latency_ms['p50']:.0f} / {drive.latency_ms['p99']:.0f} ms"
 
 
-def _saving_vs_x264(drive: DriveFigures) -> str:
-    saving = drive.saving_vs_x264_percent
-    return "not measured" if saving is None else f"{saving:.1f} %"
-
-
 SUMMARY: tuple[tuple[str, str, Callable[[DriveFigures], str]], ...] = (
     (
         "Saving against low-delay x264",
         "at equal quality (RGB PSNR), whole packets on both sides, x264 tuned for PSNR",
-        _saving_vs_x264,
+        lambda drive: f"{drive.saving_vs_x264_percent:.1f} %",
     ),
     (
         "Saving against I pictures",
@@ -130,27 +122,6 @@ def print_summary(console: Console, result: Result, out: Path) -> None:
         console.print(f"  {out / name}")
 
 
-def demo_section(path: Path, result: Result) -> str:
-    """Return the summary and the published metric as a section of the results page."""
-    drives = figures_of(result)
-    rows = [
-        [f"{label} ({note})", *(show(drive) for drive in drives.values())]
-        for label, note, show in SUMMARY
-    ]
-    rows += [
-        [f"100·I/(I+P) with {label}", *(f"{show(drive):.1f} %" for drive in drives.values())]
-        for label, show in METRIC
-    ]
-    settings, field = result["settings"], result["field"]
-    facts = (
-        f"Field of {field['gaussians']:,} Gaussians, {field['held_out_psnr_db']:.2f} dB on the "
-        f"held-out empty drive; coder {settings['effort']}, CRF {settings['crf']:g}, "
-        f"{settings['rate_hz']:g} Hz, link {settings['link_bps'] / 1e6:g} Mbit/s and "
-        f"{settings['link_delay_ms']:g} ms."
-    )
-    return "\n\n".join([heading(path, result), facts, markdown_table(["", *drives], rows), ""])
-
-
 def write_report(
     path: Path,
     result: Result,
@@ -200,9 +171,8 @@ def _headline(drives: Mapping[str, DriveFigures]) -> str:
     )
     parts = []
     for rival, percent in savings:
-        known = [f"{value:.0f} % ({name})" for name, value in percent.items() if value is not None]
-        if known:
-            parts.append(f"than {rival}: {', '.join(known)}")
+        shown = ", ".join(f"{value:.0f} % ({name})" for name, value in percent.items())
+        parts.append(f"than {rival}: {shown}")
     return "Fewer bytes at equal quality " + "; ".join(parts)
 
 

@@ -98,9 +98,6 @@ class LoadRow:
     renderer: str = CPU
     threads: int = 1
     """Of a render."""
-    command: str | None = None
-    """In a file of several runs, as ``revision``: how this row was made."""
-    revision: str | None = None
     run: int | None = None
     """Number of the run, from 1, where a load is repeated."""
 

@@ -18,7 +18,7 @@ from rfcore.extras import needs
 with needs("loadtest"):
     import psutil
 
-__all__ = ["Sample", "Usage", "Watcher", "slope_per_minute"]
+__all__ = ["Sample", "Usage", "Watcher"]
 
 EVERY_S = 0.5
 
@@ -144,18 +144,6 @@ def sample(process: psutil.Process) -> Sample:
         threads=threads,
         children=len(family) - 1,
     )
-
-
-def slope_per_minute(samples: Sequence[Sample]) -> float:
-    """Return the least-squares slope of memory in MB per minute."""
-    if len(samples) < 2:
-        return 0.0
-    minutes = [(s.at_s - samples[0].at_s) / 60 for s in samples]
-    mean_t = sum(minutes) / len(minutes)
-    mean_mb = sum(s.rss_mb for s in samples) / len(samples)
-    spread = sum((t - mean_t) ** 2 for t in minutes)
-    pairs = zip(minutes, samples, strict=True)
-    return sum((t - mean_t) * (s.rss_mb - mean_mb) for t, s in pairs) / spread if spread else 0.0
 
 
 def _machine_seconds() -> tuple[float, float]:

@@ -1,20 +1,14 @@
-"""Estimates as a table for a terminal, and the page of the measured tables."""
+"""Print an estimate as a table on the terminal."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator, Sequence
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from rfedge.results import Result, rows_of
 from rfedge.sizing.estimate import Sizing
-from rfedge.sizing.tables import CODECS, SizingCell
 
-__all__ = ["print_sizing", "tables_page"]
-
-PAGE_DB = (32.0, 34.0, 36.0)
+__all__ = ["print_sizing"]
 
 
 def print_sizing(console: Console, sizing: Sizing) -> None:
@@ -61,34 +55,3 @@ def print_sizing(console: Console, sizing: Sizing) -> None:
     )
     for note in sizing.beyond:
         console.print(f"[yellow]Note[/]: {note}")
-
-
-def tables_page(result: Result) -> str:
-    """Return the tables of a result of ``rfedge-lab size-tables`` as Markdown."""
-    cells = rows_of(SizingCell, result["cells"])
-    lines = ["| size | Hz | frames | codec | " + " | ".join(f"{db:g} dB" for db in PAGE_DB)]
-    lines[0] += " | sender | receiver |"
-    lines.append("|---|---|---|---|" + "---|" * (len(PAGE_DB) + 2))
-    lines += _page_rows(sorted(cells, key=lambda c: (c.pixels, c.hz, CODECS.index(c.codec))))
-    return "\n".join(lines) + "\n"
-
-
-def _page_rows(cells: Sequence[SizingCell]) -> Iterator[str]:
-    for cell in cells:
-        sizes = " | ".join(_kbit_s(cell, db) for db in PAGE_DB)
-        yield (
-            f"| {cell.width_px}x{cell.height_px} | {cell.hz:.3g} | {cell.frames} | {cell.codec} | "
-            f"{sizes} | {cell.sender_ms:.1f} | {cell.receiver_ms:.1f} |"
-        )
-
-
-def _kbit_s(cell: SizingCell, db: float) -> str:
-    """Return kbit/s with the interval, n/a where the cell does not reach the quality."""
-    if db not in cell.psnr_db:
-        return "n/a"
-    at = list(cell.psnr_db).index(db)
-    low, mean, high = (
-        column[at] * 8e-3 * cell.hz
-        for column in (cell.low_bytes, cell.bytes_per_frame, cell.high_bytes)
-    )
-    return f"{mean:.0f} ({low:.0f}..{high:.0f})"

@@ -25,7 +25,7 @@ from rfedge.demo.measure import (
     rival_curve,
     saving_at_equal_psnr,
 )
-from rfedge.demo.report import demo_section, figures_of, print_summary, write_report
+from rfedge.demo.report import figures_of, print_summary, write_report
 from rfedge.evaluate.rivals import x264_for_psnr
 from rfedge.report.charts import STAGES
 from rfedge.results import Provenance, make_result
@@ -162,16 +162,6 @@ def test_at_80_columns_the_summary_has_each_figure_whole(tmp_path: Path) -> None
         (line,) = [x for x in text.splitlines() if shown in x]
         assert line.count(shown) == 2
     assert str(tmp_path / "report.html") in text.replace("\n", "")
-
-
-def test_a_result_from_before_x264_was_measured_says_so() -> None:
-    old = replace(DRIVE, saving_vs_x264_percent=None, x264_setting=None)
-    result = result_of(empty=old)
-    assert "saving_vs_x264_percent" not in result["sequences"]["empty"]
-    section = demo_section(Path("demo.json"), result)
-    assert "tuned for PSNR) | not measured |" in section
-    assert "| 100·I/(I+P) with a grey picture | 12.5 % |" in section
-    assert "Field of 12,345 Gaussians, 28.49 dB" in section
 
 
 # --- rivals at equal quality

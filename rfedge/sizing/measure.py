@@ -1,21 +1,17 @@
-"""``rfedge-lab size-tables`` from its drives to the tables.
+"""Measure cells of the sizing tables: a clip coded by us and by the rivals, decoded, and timed.
 
-A cell of the tables is a clip coded by ours and by the rivals, decoded, and timed. Rivals are those
-of ``rfedge eval compare``, in the form that is fairest to them at a PSNR: x264 and x265 veryfast
-tuned for PSNR, SVT-AV1 preset 8, all for low delay with one key frame.
+The rivals are those of ``rfedge eval compare``, in the form that is fairest to them at a PSNR: x264
+and x265 veryfast tuned for PSNR, SVT-AV1 preset 8, all for low delay with one key frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from time import process_time_ns
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig
@@ -30,28 +26,25 @@ from rfedge.evaluate.clips import STEADY, Clip, CodedClip, Drive, DriveName, psn
 from rfedge.evaluate.field_coder import FieldCoder, RenderedClip, render_clip
 from rfedge.evaluate.rivals import Rival, svtav1_lowdelay, x264_for_psnr, x265_for_psnr
 from rfedge.offline import FrameInput, decode_promised, encode_frames
-from rfedge.results import check_result_path, make_result, provenance, write_result
 from rfedge.sizing.estimate import Demand
 from rfedge.sizing.tables import SizingCell, SizingTables, interpolated
 
 __all__ = [
     "MIN_FRAMES",
     "SETTLED_FRAMES",
-    "SizingJob",
     "measured_cells",
     "own_tables",
     "read_sized_drive",
-    "run_sizing",
 ]
 
 MIN_FRAMES = 5
 SETTLED_FRAMES = 8
 SETTLING = slice(4, None)
-"""A rival's frames after its key frame predict from what that frame was coded better than they
-need: at 30 Hz x264's sizes still grow in the fourth. Clips of ``SETTLED_FRAMES`` leave so many out;
-shorter ones, of slow cameras, the first alone."""
+"""Frames that count in a clip of at least ``SETTLED_FRAMES``; shorter clips leave out the first
+alone. An encoder spends more on its key frame than it must, and the next frames profit: at 30 Hz
+the sizes of x264 still grow in the fourth frame."""
 MIDDLE_DB = 34.0
-"""Where the times and the sizes of single frames are taken."""
+"""Quality at which times and the sizes of single frames are taken."""
 STEP_DB = 0.5
 DRAWS, SEED = 200, 1
 RIVALS = {
@@ -177,96 +170,7 @@ def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
     return [round(float(value), 1) for value in values]
 
 
-STEPS = (1, 2, 3, 5)
-"""Every n-th frame of a drive stands for a slower camera."""
-SLOW_HZ = 5.0
-"""Up to it pictures differ so much that what the first was coded better is of little use."""
 SAME_RATE = 0.02
-
-
-@dataclass(frozen=True)
-class SizingJob:
-    """What to measure; see ``rfedge-lab size-tables --help``."""
-
-    drives: Sequence[DriveName]
-    field: Path
-    sizes_px: Sequence[tuple[int, int]]
-    out: Path
-    cells: Path
-    quick: bool = False
-
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-
-
-@dataclass(frozen=True)
-class Footage:
-    """Frames of a drive that one cell of every codec is measured on."""
-
-    drive: DriveName
-    size_px: tuple[int, int]
-    step: int
-    frames: int
-
-    @property
-    def hz(self) -> float:
-        """Pictures a second of the camera they stand for."""
-        return self.drive.rate_hz / self.step
-
-
-def run_sizing(job: SizingJob, console: Console) -> dict[str, Any]:
-    """Measure what is not there yet, write ``job.out`` and return it."""
-    field = load_field(job.field)
-    store, made = CellStore(job.cells), provenance([job.field])
-    cells: list[SizingCell] = []
-    for footage in planned(job):
-        console.print(f"  {_words(footage)}")
-        cells += _footage_cells(footage, field, store)
-    streets = ", ".join(f"{drive.scene} at {drive.rate_hz:g} Hz" for drive in job.drives)
-    content = {
-        "measured_on": f"{streets}; field {field.field_id[:12]}",
-        "quick": job.quick,
-        "cells": cells,
-    }
-    result = make_result("sizing", made, content)
-    write_result(job.out, result)
-    return result
-
-
-def planned(job: SizingJob) -> list[Footage]:
-    """Return what is measured: each size and rate once, of the drive that has most frames of it."""
-    best: dict[tuple[tuple[int, int], float], Footage] = {}
-    for footage in _possible(job):
-        other = best.get((footage.size_px, footage.hz))
-        if other is None or footage.frames > other.frames:
-            best[footage.size_px, footage.hz] = footage
-    return sorted(best.values(), key=lambda f: (f.size_px, f.hz))
-
-
-def _possible(job: SizingJob) -> Iterator[Footage]:
-    for drive in job.drives:
-        pictures = read_dataset(drive.dataset).pictures
-        own = pictures[0].camera.intrinsics
-        count = MIN_FRAMES if job.quick else len(pictures)
-        for size_px in job.sizes_px:
-            if size_px <= (own.width_px, own.height_px):
-                for step in STEPS[:1] if job.quick else STEPS:
-                    frames = -(-count // step)
-                    slow = drive.rate_hz / step <= SLOW_HZ
-                    if frames >= (MIN_FRAMES if slow or job.quick else SETTLED_FRAMES):
-                        yield Footage(drive, size_px, step, frames)
-
-
-def _footage_cells(
-    footage: Footage, field: RadianceField, store: CellStore
-) -> Iterator[SizingCell]:
-    drive = read_sized_drive(footage.drive, footage.size_px, footage.frames * footage.step)
-    yield from measured_cells(drive.every(footage.step), field, store)
-
-
-def _words(footage: Footage) -> str:
-    width_px, height_px = footage.size_px
-    return f"{width_px}x{height_px} at {footage.hz:g} Hz: {footage.frames} frames"
 
 
 def own_tables(
