@@ -191,9 +191,9 @@ sample-field: build-full  ## train the field that ships in samples/fields (some 
 	$(BIN)/python -m rfedge.demo.field samples/street $(ARGS)
 
 bench: build-full  ## measure kernels and codec: correctness first, then time
-	$(BIN)/rfedge bench raster
-	$(BIN)/rfedge bench train
-	$(BIN)/rfedge bench codec
+	$(BIN)/rfedge-lab bench raster
+	$(BIN)/rfedge-lab bench train
+	$(BIN)/rfedge-lab bench codec
 
 results results-full: build-full  ## record anew what takes two hours, or everything (lab/results/record.mk; DATA)
 	$(MAKE) -f lab/results/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge

@@ -9,6 +9,7 @@ import tyro
 from tyro.conf import subcommand
 
 from lab.adapt import EvalAdapt
+from lab.bench import Bench
 from lab.benchmark import EvalBenchmark
 from lab.city import PlanCity
 from lab.classes import EvalClasses
@@ -29,6 +30,7 @@ __all__ = ["main", "parse"]
 
 Verb = (
     Annotated[EvalAdapt, subcommand("adapt")]
+    | Annotated[Bench, subcommand("bench")]
     | Annotated[EvalBenchmark, subcommand("benchmark")]
     | Annotated[PlanCity, subcommand("city")]
     | Annotated[EvalClasses, subcommand("classes")]

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from lab.adapt.measure import adapt_section
+from lab.bench import bench_section
 from lab.benchmark.definition import benchmark_section
 from lab.classes.measure import classes_section
 from lab.latency.report import latency_section, write_latency_figures
@@ -26,7 +27,6 @@ from lab.servers.cases import scale_section, world_section
 from lab.soak import soak_section
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
-from rfedge.bench import bench_section
 from rfedge.evaluate.compare.figures import write_bd_rates, write_compare_figures
 from rfedge.evaluate.compare.report import compare_section, harder_sentence, headline
 from rfedge.evaluate.ladder.page import write_ladder_figure

@@ -1,4 +1,4 @@
-# What `rfedge eval` and `rfedge bench` record in results/, on a quiet machine from a committed revision:
+# What `rfedge eval` and `rfedge-lab bench` record in results/, on a quiet machine from a committed revision:
 #     make results [DATA=FOLDER]         what takes two hours of two cores
 #     make results-full [DATA=FOLDER]    the rest, too, which takes days
 # DATA is a folder that has `street` (the yardstick), `kitti/city` and `kitti/loop` (docs/how-to/data.md); without it the
@@ -129,9 +129,9 @@ NOISY := sample-vehicles@10=$(VEHICLES)$(COMMA)noise=1.5 sample-vehicles@10=$(VE
 # --- records
 
 $(OUT)/bench-%.json: | $(OUT)
-	$(RFEDGE) bench $* --json $@
+	$(LAB) bench $* --json $@
 $(OUT)/bench-gpu.json: | $(OUT)  # on PoCL where there is no other OpenCL
-	$(RFEDGE) bench raster --rows native --isa opencl --json $@
+	$(LAB) bench raster --rows native --isa opencl --json $@
 # What a machine with a GPU carries, with and without it: a server's vehicles, and both ends of one vehicle. Sixteen
 # workers' memory takes half a minute to settle.
 LOADTEST = $(RFEDGE) loadtest --record $@ --duration 15 --warm-up 30 --workers $(shell nproc)

@@ -13,7 +13,7 @@ from rfedge.cli.dataset import Dataset
 from rfedge.cli.demo import Demo
 from rfedge.cli.field import Field
 from rfedge.cli.localise import Localise
-from rfedge.cli.measure import Bench, Eval, LoadTest
+from rfedge.cli.measure import Eval, LoadTest
 from rfedge.cli.render import Render
 from rfedge.cli.services import Certs, Link, Watch
 from rfedge.cli.size import Size
@@ -38,7 +38,6 @@ Verb = (
     | Annotated[Watch, subcommand("watch")]
     | Annotated[Twin, subcommand("twin")]
     | Annotated[Certs, subcommand("certs")]
-    | Annotated[Bench, subcommand("bench")]
     | Annotated[Eval, subcommand("eval")]
 )
 

@@ -1,4 +1,4 @@
-"""Verbs that measure: ``rfedge bench``, ``rfedge loadtest`` and ``rfedge eval``."""
+"""Verbs that measure: ``rfedge loadtest`` and ``rfedge eval``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import arg, subcommand
 
 from rfedge.arguments import DATASET, FIELD, FOLDER, RENDERER, field_path
 from rfedge.evaluate.compare import EvalCompare
@@ -14,41 +14,7 @@ from rfedge.evaluate.ladder import EvalLadder
 from rfedge.evaluate.never_worse import EvalNeverWorse
 from rfedge.samples import sample_path
 
-__all__ = ["Bench", "Eval", "LoadTest"]
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Check a part against its definition, then time it: medians of at least 20 repetitions."""
-
-    case: Annotated[Literal["raster", "train", "codec", "ngp", "decoders"], Positional]
-    """What to measure."""
-    rows: Literal["all", "native", "modes"] = "all"
-    """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
-    antialiasing, depth and opacity cost, as ratios (raster only)."""
-    field: Annotated[Path | None, FIELD] = None
-    """A trained hash grid of the sample street to time, instead of one learnt on the spot (ngp
-    only)."""
-    isa: Annotated[str | None, arg(metavar="opencl[:DEVICE]")] = None
-    """Measure this OpenCL device beside the CPU (raster only)."""
-    json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
-    """Write one JSON object to this file; `-` is standard output."""
-
-    def run(self) -> None:
-        """Run one case and print its rows."""
-        from rfcore.errors import InvalidInput
-        from rfcore.raster.renderers import is_opencl
-        from rfedge.bench import print_rows, run_case
-        from rfedge.results import write_result
-
-        if self.isa is not None and (self.case != "raster" or not is_opencl(self.isa)):
-            raise InvalidInput("isa", f"{self.isa!r}: `bench raster` takes opencl[:DEVICE]")
-        field = field_path(self.field) if self.field is not None else None
-        result = run_case(self.case, rows=self.rows, field=field, isa=self.isa)
-        if self.json is None:
-            print_rows(result)
-        else:
-            write_result(self.json, result)
+__all__ = ["Eval", "LoadTest"]
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,6 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("certs", "init", "--vehicles", "a/b"), "'a/b' must be"),
         (("eval", "compare", FIELD, "drive.json"), "NAME@HZ=DATASET"),
         (("eval", "ladder", "nowhere"), "'nowhere' is no field"),
-        (("bench", "ngp", "--field", "nowhere"), "'nowhere' is no field"),
         (("train", TRAIN_VIEWS, "--out", "f.rff", "--report", "r.html"), "add --holdout 8"),
         (("dataset", "convert", "nowhere", "--out", "o"), "nowhere"),
         (("dataset", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),

@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from lab.bench.street import street_camera, street_gaussians
 from mec_server.config import DecoderKind
 from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.decoding.process import LossCause
@@ -48,7 +49,6 @@ from rfcore.native.yuv import field_view_from_view, i420_from_rgb
 from rfcore.raster.native import Rasterizer
 from rfcore.views import FieldView
 from rfcore.wire.messages import Frame
-from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
 from rfedge.samples import sample_path
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from lab.bench import codec, run_case
+from lab.bench.street import street_gaussians
 from mec_server.config import DecoderKind
-from rfedge.bench import codec, run_case
-from rfedge.bench.street import street_gaussians
 from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
 
 KINDS = (DecoderKind.IN_PROCESS, DecoderKind.CHILD)

@@ -1,4 +1,4 @@
-"""Benchmarks: each part is checked against its definition first and then timed.
+"""``rfedge-lab bench``: each part is checked against its definition first and then timed.
 
 A case is one module here, which declares its row as a dataclass; importing it is left to the run,
 so that a case loads only what it measures.
@@ -7,18 +7,53 @@ so that a case loads only what it measures.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
 
 from rfcore.errors import InvalidInput
-from rfedge.results import Result, make_result, provenance
+from rfedge.arguments import FIELD, field_path
+from rfedge.results import Result, make_result, provenance, write_result
 
-__all__ = ["CASES", "Rows", "bench_section", "flattened", "print_rows", "run_case"]
+__all__ = ["CASES", "Bench", "Rows", "bench_section", "flattened", "print_rows", "run_case"]
 
 CASES = ("raster", "train", "codec", "ngp", "decoders")
 Rows = Literal["all", "native", "modes"]
 """Which rows to run: ``native`` leaves out what only the slow reference fills in, ``modes`` are
 the specialisations of the renderer instead."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Check a part against its definition, then time it: medians of at least 20 repetitions."""
+
+    case: Annotated[Literal["raster", "train", "codec", "ngp", "decoders"], Positional]
+    """What to measure."""
+    rows: Literal["all", "native", "modes"] = "all"
+    """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
+    antialiasing, depth and opacity cost, as ratios (raster only)."""
+    field: Annotated[Path | None, FIELD] = None
+    """A trained hash grid of the sample street to time, instead of one learnt on the spot (ngp
+    only)."""
+    isa: Annotated[str | None, arg(metavar="opencl[:DEVICE]")] = None
+    """Measure this OpenCL device beside the CPU (raster only)."""
+    json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
+    """Write one JSON object to this file; `-` is standard output."""
+
+    def run(self) -> None:
+        """Run one case and print its rows."""
+        from rfcore.raster.renderers import is_opencl
+
+        if self.isa is not None and (self.case != "raster" or not is_opencl(self.isa)):
+            raise InvalidInput("isa", f"{self.isa!r}: `bench raster` takes opencl[:DEVICE]")
+        field = field_path(self.field) if self.field is not None else None
+        result = run_case(self.case, rows=self.rows, field=field, isa=self.isa)
+        if self.json is None:
+            print_rows(result)
+        else:
+            write_result(self.json, result)
 
 
 def run_case(
@@ -37,27 +72,27 @@ def run_case(
 
 def _rows_of(case: str, rows: Rows, field: Path | None, isa: str | None) -> Sequence[object]:
     if case == "raster" and isa is not None:
-        from rfedge.bench.raster import opencl_rows
+        from lab.bench.raster import opencl_rows
 
         return opencl_rows(isa)
     if case == "raster":
-        from rfedge.bench.raster import mode_rows, raster_rows
+        from lab.bench.raster import mode_rows, raster_rows
 
         return mode_rows() if rows == "modes" else raster_rows(rows)
     if case == "train":
-        from rfedge.bench.train import train_rows
+        from lab.bench.train import train_rows
 
         return train_rows()
     if case == "codec":
-        from rfedge.bench.codec import codec_rows
+        from lab.bench.codec import codec_rows
 
         return codec_rows()
     if case == "ngp":
-        from rfedge.bench.ngp import ngp_rows
+        from lab.bench.ngp import ngp_rows
 
         return ngp_rows(field)
     if case == "decoders":
-        from rfedge.bench.codec import decoder_rows
+        from lab.bench.codec import decoder_rows
 
         return decoder_rows()
     raise InvalidInput("case", f"{case!r} is not one of {', '.join(CASES)}")

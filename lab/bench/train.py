@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lab.bench.street import street_camera, street_gaussians
 from rfcore.errors import RfedgeError
 from rfcore.extras import needs
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
-from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.timing import median_ms
 
 __all__ = ["TrainRow", "check_gradients", "train_rows"]

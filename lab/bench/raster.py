@@ -26,13 +26,13 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.bench import Rows
+from lab.bench.street import street_camera, street_gaussians
 from rfcore.camera import Camera
 from rfcore.errors import RfedgeError
 from rfcore.extras import needs
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
-from rfedge.bench import Rows
-from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.timing import median_ms, medians_ms
 
 __all__ = [

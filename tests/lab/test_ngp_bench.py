@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.bench import ngp
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.ngp.native import NgpRenderer
@@ -18,7 +19,6 @@ from rfcore.ngp.shape import (
     grid_levels,
     initial_parameters,
 )
-from rfedge.bench import ngp
 from rfedge.results import as_json
 
 KEYS = [

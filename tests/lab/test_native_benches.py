@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from forward_isas import DEVICE, OPENCL
+from lab.bench import print_rows, raster, run_case, train
+from lab.bench.street import street_camera, street_gaussians
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
@@ -14,8 +16,6 @@ from rfcore.raster.native import Rasterizer
 from rfcore.raster.opencl import open_device
 from rfcore.views import View
 from rfedge import timing
-from rfedge.bench import print_rows, raster, run_case, train
-from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.results import write_result
 
 RASTER_KEYS = [
