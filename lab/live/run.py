@@ -26,8 +26,8 @@ from lab.soak import slope_per_minute
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable, InvalidInput, RfedgeError
 from rfcore.image import jpeg_bytes
-from rfedge.demo.processes import command_of, service
 from rfedge.loadtest.usage import Usage, Watcher
+from rfedge.processes import command_of, service
 from rfedge.results import CHECKOUT, check_result_path, make_result, provenance, write_result
 
 __all__ = ["LiveCamera", "LiveJob", "measure_source", "run_live"]

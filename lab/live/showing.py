@@ -27,10 +27,10 @@ from rfcore.extras import needs
 from rfcore.field import load_field
 from rfcore.wire.twin import TwinPicture
 from rfcore.wire.twin_client import TwinClient
-from rfedge.demo.processes import Service, command_of, service
 from rfedge.loadtest.drive import drive_prerecorded
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.prerecorded import prerecorded_drive
+from rfedge.processes import Service, command_of, service
 
 with needs("loadtest"):
     import psutil

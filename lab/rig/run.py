@@ -29,7 +29,7 @@ from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
 from rfcore.wire.twin_client import TwinClient
-from rfedge.demo.processes import Service, command_of, service
+from rfedge.processes import Service, command_of, service
 from rfedge.results import Result, as_json, make_result, provenance
 
 __all__ = ["RigJob", "Spread", "TwinKeeper", "instants_apart", "run_rig", "spreads_of"]

@@ -23,7 +23,7 @@ from typing import Any
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
-from rfedge.demo.processes import Service, command_of, service
+from rfedge.processes import Service, command_of, service
 
 __all__ = [
     "CLUSTER",

@@ -22,7 +22,7 @@ from lab.servers.scale import Fleet, Lines, ScaleJob, failures, p99
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.nats import NatsServers
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
-from rfedge.demo.processes import command_of, service
+from rfedge.processes import command_of, service
 from rfedge.twin.nats_source import NatsPictures
 
 __all__ = ["NatsServer", "nats_binary", "nats_rows", "undisturbed"]

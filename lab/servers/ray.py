@@ -23,7 +23,7 @@ from lab.servers.cases import Measured, RayTiles, ScaleRow
 from lab.servers.scale import Case, ScaleJob
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.split import LIST_NAME, read_tiles
-from rfedge.demo.processes import command_of
+from rfedge.processes import command_of
 
 __all__ = ["TileRun", "overhead_percent", "ray_case", "require_resumed", "train_tiles"]
 

@@ -42,8 +42,8 @@ from rfcore.wire.tiles import Area
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
 from rfcore.wire.twin_client import TwinClient
 from rfedge.datasets.convert import convert_dataset
-from rfedge.demo.processes import command_of
 from rfedge.loadtest.run import TestBed
+from rfedge.processes import command_of
 from rfedge.results import provenance, read_result, rows_of
 from rfedge.samples import sample_path
 

@@ -30,7 +30,7 @@ from rfedge.demo.measure import (
     Pictures,
     measure_drive,
 )
-from rfedge.demo.processes import command_of, run_to_end, service
+from rfedge.processes import command_of, run_to_end, service
 from rfedge.results import make_result, provenance, write_result
 from rfedge.video import write_mp4
 

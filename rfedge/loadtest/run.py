@@ -13,7 +13,6 @@ from typing import Any
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CoderSettings
 from rfcore.field import load_field
 from rfcore.raster.renderers import CPU
-from rfedge.demo.processes import Service, command_of, service
 from rfedge.loadtest.drive import (
     RunMeasurements,
     drive_live,
@@ -25,6 +24,7 @@ from rfedge.loadtest.plan import Load, Mode, Vehicles
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
 from rfedge.loadtest.usage import Usage
 from rfedge.loadtest.verdict import Verdict, judge
+from rfedge.processes import Service, command_of, service
 
 __all__ = ["LoadRow", "Run", "TestBed", "recorded", "run_load"]
 

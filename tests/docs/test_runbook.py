@@ -31,7 +31,7 @@ from rfcore.wire.tiles import Area
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.cli import parse
-from rfedge.demo.processes import command_of, service
+from rfedge.processes import command_of, service
 
 __all__ = ["serve", "street", "vehicle"]
 

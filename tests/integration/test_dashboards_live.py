@@ -21,7 +21,7 @@ import pytest
 
 from mec_server.tile_history import LEARNING, Learnt, TileHistory
 from rfcore.wire.publish import Ground, publish
-from rfedge.demo.processes import command_of
+from rfedge.processes import command_of
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy" / "prometheus"

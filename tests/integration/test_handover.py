@@ -36,7 +36,7 @@ from rfcore.wire.twin import (
     twin_message_from_wire,
 )
 from rfcore.wire.v1 import twin_pb2_grpc
-from rfedge.demo.processes import command_of
+from rfedge.processes import command_of
 
 BORDER_M = 0.25
 """The drive is at 0.0, 0.1 ... 0.5 m east: pictures 0 to 2 belong to the west."""

@@ -29,7 +29,7 @@ from rfcore.wire.twin import (
 )
 from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.v1 import twin_pb2_grpc
-from rfedge.demo.processes import command_of
+from rfedge.processes import command_of
 from rfedge.watch import WatchSettings, watch
 
 

@@ -22,7 +22,7 @@ from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, twin_messa
 from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge import watch as module
-from rfedge.demo.processes import command_of
+from rfedge.processes import command_of
 from rfedge.watch import WatchSettings, watch_until_stopped
 
 DEPARTURE = twin_message_to_wire(Departure("cav-1", "front"))

@@ -24,7 +24,7 @@ from rfcore.image import rgb_from_bytes
 from rfcore.metrics import ssim
 from rfcore.wire.address import Address
 from rfcore.wire.tiles import LearntLight, Tile, TileLight
-from rfedge.demo.processes import command_of, service
+from rfedge.processes import command_of, service
 from rfedge.samples import sample_path
 from rfedge.twin.comparing import Comparer
 from rfedge.twin.scene import Board, TwinScene

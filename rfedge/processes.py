@@ -1,6 +1,6 @@
-"""Start, await and stop the demo's processes.
+"""Start, await and stop the project's commands as processes of this machine.
 
-A service says that it is listening by writing HOST:PORT to its ready file; nothing here guesses
+A service says that it listens by writing HOST:PORT to its ready file, so nothing here guesses
 ports. A process that ends early is reported with the last lines of its log.
 """
 
@@ -68,11 +68,9 @@ def run_to_end(name: str, command: Sequence[str], work_dir: Path, timeout_s: flo
                 list(command), stdout=log, stderr=subprocess.STDOUT, timeout=timeout_s, check=False
             )
         except subprocess.TimeoutExpired:
-            raise RfedgeError(
-                f"{name} did not end within {timeout_s:.0f} s{_tail(log_path)}"
-            ) from None
+            raise _failure(f"{name} did not end within {timeout_s:.0f} s", log_path) from None
     if done.returncode != 0:
-        raise RfedgeError(f"{name} ended with status {done.returncode}{_tail(log_path)}")
+        raise _failure(f"{name} ended with status {done.returncode}", log_path)
 
 
 def _await_ready(
@@ -81,12 +79,10 @@ def _await_ready(
     deadline = time.monotonic() + START_TIMEOUT_S
     while not ready_path.exists():
         if process.poll() is not None:
-            raise RfedgeError(
-                f"{name} ended with status {process.returncode} before it was ready"
-                f"{_tail(log_path)}"
-            )
+            status = process.returncode
+            raise _failure(f"{name} ended with status {status} before it was ready", log_path)
         if time.monotonic() > deadline:
-            raise RfedgeError(f"{name} not ready after {START_TIMEOUT_S:.0f} s{_tail(log_path)}")
+            raise _failure(f"{name} not ready after {START_TIMEOUT_S:.0f} s", log_path)
         time.sleep(POLL_S)
 
 
@@ -97,11 +93,11 @@ def _stop(name: str, process: subprocess.Popen[bytes], log_path: Path) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-        raise RfedgeError(
-            f"{name} did not stop within {STOP_TIMEOUT_S:.0f} s of SIGTERM{_tail(log_path)}"
-        ) from None
+        problem = f"{name} did not stop within {STOP_TIMEOUT_S:.0f} s of SIGTERM"
+        raise _failure(problem, log_path) from None
 
 
-def _tail(log_path: Path) -> str:
+def _failure(problem: str, log_path: Path) -> RfedgeError:
+    """Return the error for a problem, with the last lines of the log."""
     lines = log_path.read_text(errors="replace").splitlines()[-LOG_LINES_SHOWN:]
-    return "".join(f"\n  {line}" for line in lines)
+    return RfedgeError(problem + "".join(f"\n  {line}" for line in lines))

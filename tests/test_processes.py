@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rfcore.errors import RfedgeError
-from rfedge.demo.processes import run_to_end, service
+from rfedge.processes import run_to_end, service
 
 LISTENS = """
 import pathlib, signal, sys
