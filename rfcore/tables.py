@@ -58,12 +58,12 @@ class Table:
         if not isinstance(values, Mapping):
             raise fail(path, f"is {shortened(values)}, not a table")
         self.path = path
-        self._values = values
+        self.values = values
         self._fail = fail
         self._asked: set[str] = set()
 
     def __contains__(self, key: str) -> bool:
-        return key in self._values
+        return key in self.values
 
     def error(self, key: str, problem: str) -> Exception:
         """Return the error for a key of this table."""
@@ -72,7 +72,7 @@ class Table:
     def value(self, key: str, default: Any = REQUIRED) -> Any:
         """Return a value as it stands in the document, or ``default``."""
         self._asked.add(key)
-        value = self._values.get(key, default)
+        value = self.values.get(key, default)
         if value is REQUIRED:
             raise self.error(key, "is missing")
         return value
@@ -162,7 +162,7 @@ class Table:
     def require_known(self, known: Iterable[str]) -> None:
         """Raise for the first key of this table that is not among ``known``."""
         names = tuple(known)
-        for key in self._values:
+        for key in self.values:
             if key not in names:
                 raise self.error(key, f"is none of {', '.join(names)}")
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
+from rfcore.dataset.keys import blamed_on
 from rfcore.dataset.source import Source, SourcePicture, SourcePoints
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.errors import DatasetError, InvalidInput
@@ -79,7 +80,7 @@ MAX_TILE_RADIUS_M = 100_000.0
 
 
 class Distortion(StrEnum):
-    """What becomes of pictures taken through a lens that distorts."""
+    """Whether pictures taken through a lens that distorts are refused or resampled."""
 
     REFUSE = "refuse"
     UNDISTORT = "undistort"
@@ -87,10 +88,11 @@ class Distortion(StrEnum):
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How a dataset is read.
+    """Options of reading a dataset.
 
-    ``tile_origin`` None: zero where the cameras are within 10 km of it, else the median camera
-    position rounded to whole metres. ``size_px`` (width, height): pictures reduced to that size.
+    ``tile_origin`` None stands for zero where the cameras are within 10 km of it, else for the
+    median camera position rounded to whole metres. Pictures are reduced to ``size_px`` (width,
+    height) if it is given.
     """
 
     tile_origin: TileOrigin | None = None
@@ -105,9 +107,9 @@ class Dataset:
     ``rate_hz`` is the mean rate of the pictures' times, ``None`` unless every picture has one and
     they increase. ``points`` is ``None`` when the dataset has none. ``undistorted`` counts the
     pictures that are resampled to take a lens out, ``sorted_out`` those that are listed but were
-    deleted as blurred (``rfcore.dataset.transforms``). ``exposure_varies`` where the dataset says
-    that every picture has an exposure of its own. ``anchor`` is of the tile's axes,
-    where the dataset states one.
+    deleted as blurred (``rfcore.dataset.transforms``). ``exposure_varies`` is true where the
+    dataset says that every picture has an exposure of its own. ``anchor`` says where on the Earth
+    the tile's axes are, if the dataset does.
     """
 
     pictures: tuple[PosedPicture, ...]
@@ -173,10 +175,8 @@ def _pinhole(picture: SourcePicture, distortion: Distortion) -> Intrinsics:
             f"{picture.where}: lens distortion {lens}; train with --undistort, or write "
             "undistorted pictures once with `rfedge dataset convert`"
         )
-    try:
+    with blamed_on(picture.where):
         return pinhole_of(picture.camera.intrinsics, lens)
-    except InvalidInput as error:
-        raise DatasetError(f"{picture.where}: {error}") from error
 
 
 def _near(picture: SourcePicture, origin: TileOrigin) -> Pose:
@@ -207,12 +207,12 @@ def localised(points: SourcePoints, origin: TileOrigin) -> PointCloud:
 
 def _check_times(pictures: Sequence[SourcePicture]) -> None:
     """Raise ``DatasetError`` where time goes back; equal times are several cameras' pictures."""
-    timed = [picture for picture in pictures if picture.time_ns is not None]
-    for before, after in pairwise(timed):
-        if (after.time_ns or 0) < (before.time_ns or 0):
+    timed = [(p.where, p.time_ns) for p in pictures if p.time_ns is not None]
+    for (_, before_ns), (where, after_ns) in pairwise(timed):
+        if after_ns < before_ns:
             raise DatasetError(
-                f"{after.where}: time {(after.time_ns or 0) / 1e9:.9g} s comes after "
-                f"{(before.time_ns or 0) / 1e9:.9g} s; put the pictures in order of time"
+                f"{where}: time {after_ns / 1e9:.9g} s comes after {before_ns / 1e9:.9g} s; put "
+                "the pictures in order of time"
             )
 
 

@@ -31,6 +31,7 @@ import numpy as np
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import (
     LENS_KEYS,
+    blamed_on,
     finite_numbers,
     lens_of,
     pose_of_quaternion,
@@ -40,7 +41,7 @@ from rfcore.dataset.keys import (
 )
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.errors import DatasetError
 from rfcore.tables import shortened
 
 __all__ = [
@@ -107,10 +108,8 @@ def camera_of(
     fx_px, fy_px = parameters[0], parameters[focal - 1]
     cx_px, cy_px = parameters[focal : focal + 2]
     lens = dict(zip(COLMAP_LENS_KEYS[model], parameters[focal + 2 :], strict=True))
-    try:
+    with blamed_on(where):
         intrinsics = Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px)
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {error}") from error
     return SourceCamera(intrinsics, lens_of(where, model, table_at(where, lens)))
 
 
@@ -198,10 +197,8 @@ def _points(file: Path) -> SourcePoints | None:
     if not rows:
         return None
     xyz_m, rgb = np.array([row[:3] for row in rows]), np.array([row[3:] for row in rows], np.uint8)
-    try:
+    with blamed_on(file):
         return SourcePoints(xyz_m, rgb)
-    except InvalidInput as error:
-        raise DatasetError(f"{file}: {error}") from error
 
 
 def _point(content: _Bytes) -> tuple[float, float, float, int, int, int]:

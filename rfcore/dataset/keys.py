@@ -1,4 +1,4 @@
-"""What the files of a dataset hold: JSON, tables of keys, lines of numbers, poses and lenses.
+"""Read the parts that dataset files are made of: JSON, TOML, lines of numbers, poses and lenses.
 
 ``where`` is the file and the place in it; every error is a ``DatasetError`` that starts with it.
 Tables are checked key by key by ``rfcore.tables``.
@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +28,12 @@ __all__ = [
     "LENS_KEYS",
     "POSE_SHAPES",
     "anchor_at",
+    "blamed_on",
+    "filled_lines",
     "finite_numbers",
     "lens_of",
     "load_json",
+    "load_toml",
     "pose_of_quaternion",
     "pose_of_rows",
     "read_file",
@@ -41,6 +46,15 @@ POSE_SHAPES = ((3, 4), (4, 4))
 """Rows and columns of a pose's matrix; what a fourth row holds is checked with the pose."""
 FILE_NORM_TOLERANCE = 1e-3
 """Trajectories are printed with as few as four decimals."""
+
+
+@contextmanager
+def blamed_on(where: object) -> Iterator[None]:
+    """Turn ``InvalidInput`` of the block into a ``DatasetError`` that begins with ``where``."""
+    try:
+        yield
+    except InvalidInput as error:
+        raise DatasetError(f"{where}: {error}") from error
 
 
 def read_file(file: Path) -> bytes:
@@ -69,6 +83,14 @@ def load_json(file: Path) -> Any:
         raise DatasetError(f"{file}: not JSON ({error})") from error
 
 
+def load_toml(file: Path) -> dict[str, Any]:
+    """Return the content of a TOML file; raise ``DatasetError`` naming it."""
+    try:
+        return tomllib.loads(read_file(file).decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{file}: not TOML ({error})") from error
+
+
 def table_at(where: str, values: object) -> Table:
     """Return a table whose errors are ``DatasetError`` and begin with ``where``."""
 
@@ -82,18 +104,14 @@ def anchor_at(where: str, values: Mapping[str, Any] | None) -> Anchor | None:
     """Return the anchor that a table states (``rfcore.geodesy``), None where there is no table."""
     if values is None:
         return None
-    try:
+    with blamed_on(where):
         return anchor_of_values(values)
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {error}") from error
 
 
 def pose_of_rows(where: str, key: str, rows: Sequence[Sequence[float]]) -> Pose:
     """Return the pose of a rigid 3x4 or 4x4 matrix."""
-    try:
+    with blamed_on(f"{where}: {key}"):
         return Pose.from_matrix(rows)
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {key}: {error}") from error
 
 
 def pose_of_quaternion(where: str, translation: Sequence[float], wxyz: Sequence[float]) -> Pose:
@@ -103,10 +121,8 @@ def pose_of_quaternion(where: str, translation: Sequence[float], wxyz: Sequence[
         raise DatasetError(f"{where}: quaternion {tuple(wxyz)} has norm {norm:.6g}, must be 1")
     x, y, z = translation
     w, i, j, k = (value / norm for value in wxyz)
-    try:
+    with blamed_on(where):
         return Pose((x, y, z), (w, i, j, k))
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {error}") from error
 
 
 def finite_numbers(where: str, words: Sequence[str]) -> list[float]:
@@ -127,6 +143,12 @@ def text_lines(file: Path) -> list[str]:
         return read_file(file).decode().splitlines()
     except UnicodeDecodeError as error:
         raise DatasetError(f"{file}: not a text file ({error.reason})") from error
+
+
+def filled_lines(file: Path) -> list[tuple[str, str]]:
+    """Return the place and the text of every line that is not blank."""
+    lines = enumerate(text_lines(file), start=1)
+    return [(f"{file}: line {number}", line) for number, line in lines if line.strip()]
 
 
 LENS_KEYS = {

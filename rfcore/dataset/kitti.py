@@ -31,11 +31,17 @@ from functools import partial
 from pathlib import Path
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.keys import finite_numbers, pose_of_rows, text_lines
+from rfcore.dataset.keys import (
+    blamed_on,
+    filled_lines,
+    finite_numbers,
+    pose_of_rows,
+    text_lines,
+)
 from rfcore.dataset.picture_file import check_size, picture_size_px, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture
 from rfcore.dataset.trajectory import time_ns
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.errors import DatasetError
 from rfcore.geodesy import Anchor
 
 __all__ = ["OXTS", "read_kitti_raw_source", "read_kitti_source"]
@@ -72,7 +78,8 @@ def read_kitti_raw_source(folder: Path) -> Source:
         if file.stem != path.stem:
             raise DatasetError(f"{file}: is of no picture; {path.name} comes next there")
     rows = [_oxts_row(file) for file in oxts]
-    anchor = _anchor(oxts[0], rows[0])
+    with blamed_on(oxts[0]):
+        anchor = Anchor(rows[0][0], rows[0][1], rows[0][2])
     imu_from_cam2 = _imu_from_cam0(calibration).compose(cam0_from_cam2)
     posed = [
         (str(file), _world_from_imu(file, row, anchor).compose(imu_from_cam2))
@@ -112,26 +119,19 @@ def _pictures(
 
 def _camera(file: Path, key: str, first: Path) -> tuple[SourceCamera, Pose]:
     """Return the colour camera and where it stands in camera 0's frame."""
-    where, p = _projection(file, key)
-    size_px = picture_size_px(first)
-    if size_px is None:
-        raise DatasetError(f"{first}: not a PNG or JPEG picture")
-    (fx_px, _, cx_px, a), (_, fy_px, cy_px, b), (_, _, _, c) = p
-    try:
-        intrinsics = Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px)
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {error}") from error
-    shift = ((a - cx_px * c) / fx_px, (b - cy_px * c) / fy_px, c)
-    cam2_from_cam0 = Pose(shift, Pose.identity().rotation)
-    return SourceCamera(intrinsics), cam2_from_cam0.inverse()
-
-
-def _projection(file: Path, key: str) -> tuple[str, tuple[list[float], ...]]:
     where, rest = _line_of(file, key)
     p = _rows(where, rest)
     if p[0][1] or p[1][0] or p[2][:3] != [0.0, 0.0, 1.0]:
         raise DatasetError(f"{where}: is not K [I | t] of a rectified camera")
-    return where, p
+    size_px = picture_size_px(first)
+    if size_px is None:
+        raise DatasetError(f"{first}: not a PNG or JPEG picture")
+    (fx_px, _, cx_px, a), (_, fy_px, cy_px, b), (_, _, _, c) = p
+    with blamed_on(where):
+        intrinsics = Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px)
+    shift = ((a - cx_px * c) / fx_px, (b - cy_px * c) / fy_px, c)
+    cam2_from_cam0 = Pose(shift, Pose.identity().rotation)
+    return SourceCamera(intrinsics), cam2_from_cam0.inverse()
 
 
 def _line_of(file: Path, key: str) -> tuple[str, str]:
@@ -143,17 +143,22 @@ def _line_of(file: Path, key: str) -> tuple[str, str]:
     raise DatasetError(f"{file}: has no line '{key}:'")
 
 
-def _rows(where: str, line: str) -> tuple[list[float], ...]:
+def _numbers(where: str, line: str, count: int, what: str) -> list[float]:
     values = finite_numbers(where, line.split())
-    if len(values) != 12:
-        raise DatasetError(f"{where}: has {len(values)} numbers, a 3x4 matrix has 12")
+    if len(values) != count:
+        raise DatasetError(f"{where}: has {len(values)} numbers, {what} has {count}")
+    return values
+
+
+def _rows(where: str, line: str) -> tuple[list[float], ...]:
+    values = _numbers(where, line, 12, "a 3x4 matrix")
     return (values[:4], values[4:8], values[8:])
 
 
 def _times_ns(file: Path, paths: Sequence[Path], read: Callable[[str, str], int]) -> list[int]:
-    rows = [(i, line) for i, line in enumerate(text_lines(file), start=1) if line.strip()]
-    _check_count(file, "times", len(rows), paths)
-    return [read(f"{file}: line {i}", line.strip()) for i, line in rows]
+    lines = filled_lines(file)
+    _check_count(file, "times", len(lines), paths)
+    return [read(where, line.strip()) for where, line in lines]
 
 
 def _poses_file(folder: Path) -> Path:
@@ -166,10 +171,9 @@ def _poses_file(folder: Path) -> Path:
 
 
 def _poses(file: Path, paths: Sequence[Path]) -> list[tuple[str, Pose]]:
-    rows = [(i, line) for i, line in enumerate(text_lines(file), start=1) if line.strip()]
-    _check_count(file, "poses", len(rows), paths)
-    places = [(f"{file}: line {i}", line) for i, line in rows]
-    return [(where, pose_of_rows(where, "pose", _rows(where, line))) for where, line in places]
+    lines = filled_lines(file)
+    _check_count(file, "poses", len(lines), paths)
+    return [(where, pose_of_rows(where, "pose", _rows(where, line))) for where, line in lines]
 
 
 def _check_count(file: Path, what: str, found: int, paths: Sequence[Path]) -> None:
@@ -177,9 +181,6 @@ def _check_count(file: Path, what: str, found: int, paths: Sequence[Path]) -> No
         folder = paths[0].parent
         name = folder.parent.name if folder.name == "data" else folder.name
         raise DatasetError(f"{file}: holds {found} {what} for {len(paths)} pictures in {name}")
-
-
-# --- raw drives
 
 
 def _unix_ns(where: str, line: str) -> int:
@@ -195,25 +196,13 @@ def _unix_ns(where: str, line: str) -> int:
 
 
 def _oxts_row(file: Path) -> list[float]:
-    lines = text_lines(file)
-    values = finite_numbers(str(file), lines[0].split() if lines else [])
-    if len(values) != OXTS_NUMBERS:
-        raise DatasetError(f"{file}: has {len(values)} numbers, a line of OXTS has {OXTS_NUMBERS}")
-    return values
-
-
-def _anchor(file: Path, row: Sequence[float]) -> Anchor:
-    try:
-        return Anchor(row[0], row[1], row[2])
-    except InvalidInput as error:
-        raise DatasetError(f"{file}: {error}") from error
+    first = next(iter(text_lines(file)), "")
+    return _numbers(str(file), first, OXTS_NUMBERS, "a line of OXTS")
 
 
 def _world_from_imu(file: Path, row: Sequence[float], anchor: Anchor) -> Pose:
-    try:
+    with blamed_on(file):
         place = anchor.world_from_geodetic(*row[:3])
-    except InvalidInput as error:
-        raise DatasetError(f"{file}: {error}") from error
     turns = [[*axes, at] for axes, at in zip(_turns(*row[3:6]), place, strict=True)]
     return pose_of_rows(str(file), "roll, pitch, yaw", turns)
 
@@ -239,16 +228,11 @@ def _imu_from_cam0(calibration: Path) -> Pose:
 
 
 def _rigid(file: Path) -> Pose:
-    where, rest = _line_of(file, "T")
-    shift = finite_numbers(where, rest.split())
-    if len(shift) != 3:
-        raise DatasetError(f"{where}: has {len(shift)} numbers, a place has 3")
-    return _matrix3(*_line_of(file, "R"), (shift[0], shift[1], shift[2]))
+    x, y, z = _numbers(*_line_of(file, "T"), 3, "a place")
+    return _matrix3(*_line_of(file, "R"), (x, y, z))
 
 
 def _matrix3(where: str, line: str, shift_m: Row3) -> Pose:
-    values = finite_numbers(where, line.split())
-    if len(values) != 9:
-        raise DatasetError(f"{where}: has {len(values)} numbers, a 3x3 matrix has 9")
+    values = _numbers(where, line, 9, "a 3x3 matrix")
     rows = [[*values[3 * i : 3 * i + 3], shift_m[i]] for i in range(3)]
     return pose_of_rows(where, "R", rows)

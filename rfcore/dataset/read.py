@@ -22,14 +22,14 @@ from typing import Any
 from rfcore.camera import Intrinsics, TileOrigin
 from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions, assemble
 from rfcore.dataset.colmap import colmap_model_folder, read_colmap_source
-from rfcore.dataset.keys import load_json, pose_of_rows, table_at
+from rfcore.dataset.keys import blamed_on, load_json, pose_of_rows, table_at
 from rfcore.dataset.kitti import OXTS, read_kitti_raw_source, read_kitti_source
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
 from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
 from rfcore.dataset.recording import read_recording_source
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, read_points
 from rfcore.dataset.transforms import read_transforms_source, transforms_file
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.errors import DatasetError
 from rfcore.tables import Table
 
 __all__ = [
@@ -84,18 +84,9 @@ def _picture(file: Path, index: int, entry: Any) -> SourcePicture:
 
 def _camera(where: str, keys: Table) -> SourceCamera:
     width_px, height_px = keys.whole("width"), keys.whole("height")
-    try:
-        intrinsics = Intrinsics(
-            width_px=width_px,
-            height_px=height_px,
-            fx_px=keys.number("fx"),
-            fy_px=keys.number("fy"),
-            cx_px=width_px / 2,
-            cy_px=height_px / 2,
-        )
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {error}") from error
-    return SourceCamera(intrinsics)
+    with blamed_on(where):
+        focal_px = keys.number("fx"), keys.number("fy")
+        return SourceCamera(Intrinsics(width_px, height_px, *focal_px, width_px / 2, height_px / 2))
 
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")

@@ -1,4 +1,4 @@
-"""What a server recorded of one camera: a folder of pictures and ``recording.jsonl``.
+"""Recordings that a server made of one camera: a folder of pictures and ``recording.jsonl``.
 
 The first line says what is recorded, each further one is a picture that was reconstructed, written
 once its file is whole; a last line without an end is one that is being written, and is left out::
@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import Any
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.keys import read_file, table_at
+from rfcore.dataset.keys import blamed_on, read_file, table_at
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.errors import DatasetError
 from rfcore.tables import Range, Table
 
 __all__ = [
@@ -49,7 +49,7 @@ DEPTH = 3
 
 @dataclass(frozen=True)
 class RecordedCamera:
-    """Whose pictures a recording holds: the first line of its file."""
+    """The camera whose pictures a recording holds: the first line of its file."""
 
     vehicle_id: str
     camera_id: str
@@ -93,7 +93,7 @@ class RecordedPicture:
 
 @dataclass(frozen=True)
 class RecordedPart:
-    """One recording file: whose pictures, and which, in order of time."""
+    """One recording file: its camera, and its pictures in order of time."""
 
     file: Path
     camera: RecordedCamera
@@ -163,10 +163,8 @@ def _camera(file: Path, head: Table) -> RecordedCamera:
         raise head.error("recording", f"is version {version}; this release reads {VERSION}")
     width_px, height_px = head.whole("width_px"), head.whole("height_px")
     numbers = [head.number(key) for key in ("fx_px", "fy_px", "cx_px", "cy_px")]
-    try:
+    with blamed_on(f"{file}: line 1"):
         intrinsics = Intrinsics(width_px, height_px, *numbers)
-    except InvalidInput as error:
-        raise DatasetError(f"{file}: line 1: {error}") from error
     return RecordedCamera(
         head.text("vehicle"), head.text("camera"), head.text("session"), intrinsics
     )
@@ -189,10 +187,8 @@ def _pose(where: str, line: Table) -> Pose | None:
         return None
     x, y, z = line.numbers("translation_m", 3)
     w, i, j, k = line.numbers("rotation_wxyz", 4)
-    try:
+    with blamed_on(where):
         return Pose((x, y, z), (w, i, j, k))  # as it was sent: to normalise it would change it
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {error}") from error
 
 
 def _json_line(values: dict[str, Any]) -> str:

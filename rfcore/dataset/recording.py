@@ -1,4 +1,4 @@
-"""One's own recording: a video or a folder of pictures, a trajectory, and ``camera.toml``.
+"""A recording of one's own: a video or a folder of pictures, a trajectory, and ``camera.toml``.
 
 ::
 
@@ -38,14 +38,12 @@ refused, since intrinsics would belong to the other orientation.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import Any
 
 import av
 from av.error import FFmpegError
@@ -54,16 +52,17 @@ from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import (
     POSE_SHAPES,
     anchor_at,
+    blamed_on,
+    filled_lines,
     lens_of,
+    load_toml,
     pose_of_rows,
-    read_file,
     table_at,
-    text_lines,
 )
 from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.errors import DatasetError
 from rfcore.image import Rgb, rgb_from_video_frame
 from rfcore.tables import Range, Table
 
@@ -100,7 +99,7 @@ class Video:
 
     @property
     def times_ns(self) -> tuple[int, ...]:
-        """When each frame is shown, from the first one on."""
+        """Times at which the frames are shown, counted from the first one."""
         tick_s = self._stream.time_base or Fraction(1, 90_000)
         return tuple(round((pts - self._pts[0]) * tick_s * 1_000_000_000) for pts in self._pts)
 
@@ -193,7 +192,7 @@ class RecordedPoses:
         )
 
     def wanted(self, time_ns: int) -> bool:
-        """Whether a picture of that time is not to be left out."""
+        """Return whether a picture of that time is to be kept."""
         return not self.drop_outside or self.trajectory.covers(time_ns + self.offset_ns)
 
     def at(self, where: str, time_ns: int) -> Pose:
@@ -240,7 +239,7 @@ def read_recording_source(file: Path) -> Source:
         if poses.wanted(picture.time_ns)
     )
     dropped = len(timed) - len(pictures)
-    anchor = anchor_at(str(file), _values_of(content.get("anchor")))
+    anchor = anchor_at(str(file), content["anchor"].values if "anchor" in content else None)
     return Source(file, pictures, _points(file, content), dropped, anchor=anchor)
 
 
@@ -254,18 +253,9 @@ def read_recording_camera(file: Path) -> RecordingCamera:
     return RecordingCamera(_camera(f"{file}: [camera]", content["camera"]), poses)
 
 
-def _values_of(table: Table | None) -> dict[str, Any] | None:
-    if table is None:
-        return None
-    return {key: table.value(key) for key in SECTIONS["anchor"].split() if key in table}
-
-
 def _load(file: Path, required: Sequence[str] = REQUIRED) -> dict[str, Table]:
     """Return the file's sections, each with no other keys than it may have."""
-    try:
-        content = tomllib.loads(read_file(file).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{file}: not TOML ({error})") from error
+    content = load_toml(file)
     for section in content:
         if section not in SECTIONS:
             raise DatasetError(f"{file}: section [{section}] is none of {', '.join(SECTIONS)}")
@@ -291,10 +281,8 @@ def _camera(where: str, keys: Table) -> SourceCamera:
     fx_px = keys.number("fx_px")
     defaults = {"fy_px": fx_px, "cx_px": width_px / 2, "cy_px": height_px / 2}
     given = {key: keys.number(key, default=default) for key, default in defaults.items()}
-    try:
+    with blamed_on(where):
         intrinsics = Intrinsics(width_px, height_px, fx_px, **given)
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {error}") from error
     return SourceCamera(intrinsics, lens_of(where, keys.value("model", "PINHOLE"), keys))
 
 
@@ -343,7 +331,7 @@ def _folder_times_ns(where: str, folder: Path, keys: Table, count: int) -> list[
             raise keys.error("rate_hz", f"is {rate_hz}, must be above 0")
         return [round(i * NS_PER_S / rate_hz) for i in range(count)]
     file = inside(where, folder, keys.text("times"))
-    rows = [(i, line) for i, line in enumerate(text_lines(file), start=1) if line.strip()]
-    if len(rows) != count:
-        raise DatasetError(f"{file}: holds {len(rows)} times for {count} pictures")
-    return [time_ns(f"{file}: line {i}", line) for i, line in rows]
+    lines = filled_lines(file)
+    if len(lines) != count:
+        raise DatasetError(f"{file}: holds {len(lines)} times for {count} pictures")
+    return [time_ns(where, line) for where, line in lines]

@@ -2,7 +2,7 @@
 
 ::
 
-    reference = "front"             # by whose poses the rig is placed; default: the first camera
+    reference = "front"             # the camera whose poses place the rig; default: the first
 
     [[camera]]
     name = "front"
@@ -25,18 +25,17 @@ Picture i of every drive was taken at the same instant.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rfcore.camera import Pose, TileOrigin, camera_on_rig
-from rfcore.dataset.keys import POSE_SHAPES, pose_of_rows, read_file, table_at
+from rfcore.dataset.keys import POSE_SHAPES, load_toml, pose_of_rows, table_at
 from rfcore.dataset.picture_file import inside
 from rfcore.dataset.read import read_dataset
 from rfcore.errors import DatasetError, InvalidInput
-from rfcore.files import whole_file
+from rfcore.files import write_whole
 from rfcore.tables import Range, Table
 from rfcore.views import PosedPicture
 
@@ -86,12 +85,12 @@ class Rig:
 
     @property
     def reference(self) -> RigCamera:
-        """The camera by whose poses the rig is placed."""
+        """The camera whose poses place the rig."""
         return self.cameras[0]
 
     @property
     def is_live(self) -> bool:
-        """Whether its cameras send now; else they are drives."""
+        """Whether the cameras send now; otherwise they are recorded drives."""
         return self.reference.source is not None
 
 
@@ -109,11 +108,7 @@ def read_rig(path: Path) -> Rig:
     Raises ``DatasetError`` that names file, camera and key.
     """
     file = path / RIG_FILE if path.is_dir() else path
-    try:
-        content = tomllib.loads(read_file(file).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{file}: not TOML ({error})") from error
-    top = table_at(str(file), content)
+    top = table_at(str(file), load_toml(file))
     top.require_known(("reference", "camera"))
     entries = top.items("camera")
     if not 1 <= len(entries) <= MAX_RIG_CAMERAS:
@@ -230,5 +225,4 @@ def write_rig(path: Path, rig: Rig) -> None:
         lines += ["camera_from_rig = [", *(f"    {row!r}," for row in rows), "]"]
         if camera.priority != 1.0:
             lines.append(f"priority = {camera.priority!r}")
-    with whole_file(path) as file:
-        file.write(("\n".join(lines) + "\n").encode())
+    write_whole(path, "\n".join(lines) + "\n")

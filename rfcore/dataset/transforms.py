@@ -26,10 +26,18 @@ from typing import Any
 import numpy as np
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.keys import POSE_SHAPES, anchor_at, lens_of, load_json, pose_of_rows, table_at
+from rfcore.dataset.keys import (
+    POSE_SHAPES,
+    anchor_at,
+    blamed_on,
+    lens_of,
+    load_json,
+    pose_of_rows,
+    table_at,
+)
 from rfcore.dataset.picture_file import check_size, find_picture, inside, picture_file, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.errors import DatasetError
 from rfcore.tables import Range, Table
 
 __all__ = ["read_transforms_source", "transforms_file"]
@@ -39,8 +47,8 @@ UNREAD_LENSES = ("ftheta_p0", "is_equirectangular", "is_latlong")
 
 
 @dataclass(frozen=True)
-class Applied:
-    """What was applied to the original world: ``file = scale (transform original)``."""
+class AppliedTransform:
+    """A transform that was applied to the original world: ``file = scale (transform original)``."""
 
     original_from_turned: Pose
     scale: float
@@ -69,11 +77,15 @@ def read_transforms_source(file: Path) -> Source:
     pictures = tuple(_picture(file, content, i, frame) for i, frame in kept)
     points = _points(file, top)
     if applied is not None:
-        pictures = tuple(_moved(picture, applied) for picture in pictures)
+        pictures = tuple(
+            replace(picture, world_from_cam=applied.undo(picture.world_from_cam))
+            for picture in pictures
+        )
         points = applied.undo_points(points) if points is not None else None
     missing = len(frames) - len(kept)
+    exposure_varies = top.choice("exposure", ("auto", "fixed"), "fixed") == "auto"
     anchor = anchor_at(str(file), content.get("anchor"))
-    return Source(file, pictures, points, missing, _exposure_varies(top), anchor)
+    return Source(file, pictures, points, missing, exposure_varies, anchor)
 
 
 def transforms_file(folder: Path) -> Path | None:
@@ -119,7 +131,7 @@ def _camera(where: str, keys: Table) -> SourceCamera:
     width_px, height_px = keys.whole("w"), keys.whole("h")
     fx_px = _focal(keys, "fl_x", "camera_angle_x", width_px)
     has_fy = "fl_y" in keys or "camera_angle_y" in keys
-    try:
+    with blamed_on(where):
         intrinsics = Intrinsics(
             width_px=width_px,
             height_px=height_px,
@@ -128,8 +140,6 @@ def _camera(where: str, keys: Table) -> SourceCamera:
             cx_px=keys.number("cx", default=width_px / 2),
             cy_px=keys.number("cy", default=height_px / 2),
         )
-    except InvalidInput as error:
-        raise DatasetError(f"{where}: {error}") from error
     return SourceCamera(intrinsics, lens_of(where, _model(keys), keys))
 
 
@@ -152,7 +162,7 @@ def _focal(keys: Table, key: str, angle_key: str, side: int) -> float:
     return 0.5 * side / math.tan(0.5 * angle_rad)
 
 
-def _applied(where: str, content: Table) -> Applied | None:
+def _applied(where: str, content: Table) -> AppliedTransform | None:
     if "applied_transform" not in content and "applied_scale" not in content:
         return None
     turned_from_original = Pose.identity()
@@ -162,15 +172,7 @@ def _applied(where: str, content: Table) -> Applied | None:
     scale = content.number("applied_scale", default=1.0)
     if scale <= 0:
         raise content.error("applied_scale", f"is {scale}, must be above 0")
-    return Applied(turned_from_original.inverse(), scale)
-
-
-def _moved(picture: SourcePicture, applied: Applied) -> SourcePicture:
-    return replace(picture, world_from_cam=applied.undo(picture.world_from_cam))
-
-
-def _exposure_varies(content: Table) -> bool:
-    return content.choice("exposure", ("auto", "fixed"), "fixed") == "auto"
+    return AppliedTransform(turned_from_original.inverse(), scale)
 
 
 def _points(file: Path, content: Table) -> SourcePoints | None:
