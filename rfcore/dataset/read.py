@@ -105,7 +105,17 @@ def read_dataset(
 ) -> Dataset:
     """Read a dataset's folder, or the file that describes it; pixels are read on demand.
 
-    Options as ``ReadOptions`` says. Raises ``DatasetError`` naming the file and the key at fault.
+    >>> from pathlib import Path
+    >>> from rfcore.dataset import read_dataset
+    >>> dataset = read_dataset(Path("samples/street/transforms_drive_empty.json"))
+    >>> len(dataset.pictures), dataset.rate_hz
+    (24, 10.0)
+    >>> first = dataset.pictures[0]
+    >>> first.read().shape, first.camera.world_from_cam.translation_m[2]
+    ((360, 640, 3), 1.62)
+
+    ``ReadOptions`` explains the options. Raises ``DatasetError`` naming the file and the key at
+    fault.
     """
     options = ReadOptions(tile_origin, Distortion(distortion), size_px)
     return assemble(read_source(path), options)

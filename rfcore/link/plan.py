@@ -135,12 +135,13 @@ def delivery_times(link: LinkProfile | DirectionPlan, schedule: Iterable[Arrival
 
 
 def read_link(path: Path) -> LinkPlan:
-    r"""Read a profile.
+    """Read a profile.
 
-    >>> from rfcore.files import write_whole
-    >>> write_whole(Path("town.toml"), "[uplink]\nrate_mbps = 4\n[downlink]\nrate_mbps = 20\n")
-    >>> read_link(Path("town.toml")).uplink.profile.rate_bps
-    4000000.0
+    >>> from pathlib import Path
+    >>> from rfcore.link import read_link
+    >>> plan = read_link(Path("samples/links/tunnel.toml"))
+    >>> plan.uplink.profile.rate_bps, [impairment.name for impairment in plan.uplink.impairments]
+    (10000000.0, ['outage'])
 
     Raises ``InvalidInput`` naming the file, the key, its value and the limit, ``InvalidData`` for a
     file that is no TOML or a trace that is none, ``OSError`` for one that cannot be read.

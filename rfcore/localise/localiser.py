@@ -133,7 +133,26 @@ class Lost:
 
 
 class Localiser:
-    """Finds the poses of pictures of one camera in one field, drawn at ``quality``."""
+    """Finds the poses of pictures of one camera in one field, drawn at ``quality``.
+
+    A search that starts 1 m beside the right pose ends within a centimetre of it:
+
+    >>> import math
+    >>> from pathlib import Path
+    >>> from rfcore.dataset import read_dataset
+    >>> from rfcore.field import load_field
+    >>> from rfcore.localise.localiser import Localiser
+    >>> from rfcore.localise.prior import PosePrior, moved
+    >>> picture = read_dataset(Path("samples/street/transforms_drive_empty.json")).pictures[0]
+    >>> right = picture.camera.world_from_cam
+    >>> localiser = Localiser(
+    ...     load_field(Path("samples/fields/street.rff")), picture.camera.intrinsics
+    ... )
+    >>> prior = PosePrior(moved(right, (1.0, 0.0, 0.0)), position_m=1.0, rotation_deg=3.0)
+    >>> found = localiser.localise(picture.read(), prior).world_from_cam
+    >>> math.dist(found.translation_m, right.translation_m) < 0.01
+    True
+    """
 
     def __init__(
         self,

@@ -30,7 +30,7 @@ MAGIC = b"RFV1\r\n\x1a\n"
 
 @dataclass(frozen=True)
 class CodedDrive:
-    """A whole coded drive: the frames are in the order of sending."""
+    """A whole coded drive; its frames are in the order of sending."""
 
     hello: Hello
     frames: tuple[Frame, ...]
@@ -46,7 +46,20 @@ def write_drive(path: Path, drive: CodedDrive) -> None:
 
 
 def read_drive(path: Path) -> CodedDrive:
-    """Read and check a coded drive.
+    """Read and check a coded drive, as ``rfedge encode`` writes it.
+
+    >>> from pathlib import Path
+    >>> from rfedge.cli.codec import Encode
+    >>> from rfcore.wire.drive_file import read_drive
+    >>> Encode(
+    ...     Path("samples/street/transforms_drive_empty.json"),
+    ...     Path("samples/fields/street.rff"),
+    ...     Path("street.rfv"),
+    ... ).run()  # doctest: +ELLIPSIS
+    street.rfv: 24 frames, ...
+    >>> drive = read_drive(Path("street.rfv"))
+    >>> len(drive.frames), [reference.name for reference in drive.frames[0].packet.references]
+    (24, ['RENDER'])
 
     Raises ``InvalidData`` with the file's name and the message's number when the file is
     truncated, oversize or not a drive; ``OSError`` when it cannot be read at all.
@@ -69,9 +82,9 @@ def read_drive(path: Path) -> CodedDrive:
 
 
 class _BoundedReader:
-    """What protobuf reads a message from: refuses a claimed length before memory is taken for it.
+    """A file that refuses a message's claimed length before memory is taken for it.
 
-    ``ValueError`` for a length above ``MAX_MESSAGE_BYTES``, and where the file ends within a
+    Raises ``ValueError`` for a length above ``MAX_MESSAGE_BYTES``, and where the file ends within a
     message.
     """
 
@@ -79,7 +92,7 @@ class _BoundedReader:
         self._file = file
 
     def read(self, size: int) -> bytes:
-        """Return ``size`` bytes; a single one, of a length, may be missing at the file's end."""
+        """Return ``size`` bytes; the single first byte of a length may be missing at the end."""
         if size > MAX_MESSAGE_BYTES:
             raise ValueError(f"claims {size} bytes, the limit is {MAX_MESSAGE_BYTES}")
         data = self._file.read(size)
