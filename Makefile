@@ -188,7 +188,7 @@ drive-long: build-full  ## render 30 s of the sample's street at 10 Hz into out/
 	$(BIN)/streetgen build samples/localise/drive_30s.toml --split drive --out out/drive-long
 
 sample-field: build-full  ## train the field that ships in samples/fields (some minutes)
-	$(BIN)/python -m rfedge.demo.field samples/street $(ARGS)
+	$(BIN)/python -m lab.sample_field samples/street $(ARGS)
 
 bench: build-full  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge-lab bench raster

@@ -1,12 +1,12 @@
 """Measure one drive of the demo: the server's pictures against the camera's.
 
-All PSNR and SSIM figures are means over pictures of the RGB metric on the true size, against the
-camera's own pixels, for the reconstruction, for the render, and for what it is compared with.
+PSNR and SSIM are means over the pictures, in RGB and at the true size, against the camera's own
+pixels: for the reconstruction, for the render, and for the encoders that we compare with.
 
 Two savings at equal PSNR are measured: against the camera frames coded as I pictures, and against
 low-delay x264 tuned for PSNR, which predicts each frame from the one before. Both rivals are coded
-at several CRFs; between these, log(bytes) is interpolated linearly over the quality in decibels,
-as rate curves of video are close to straight there. Nothing is said outside them.
+at several CRFs. Between them log(bytes) is interpolated linearly over decibels, because rate curves
+of video are close to straight there. A quality outside the curve is refused.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ __all__ = [
     "Pictures",
     "RatePoint",
     "intra_curve",
-    "luma_psnr_db",
     "measure_drive",
     "rival_curve",
     "saving_at_equal_psnr",
@@ -57,24 +56,32 @@ class RatePoint:
     mean_psnr_db: float
 
 
-def luma_psnr_db(a: I420, b: I420) -> float:
-    """Return the PSNR of the luma planes, peak 255; infinite for identical planes."""
-    return psnr(a.y, b.y)
-
-
 def intra_curve(
-    frames: Sequence[I420], preset: str, crfs: Sequence[float], quality: Quality = luma_psnr_db
+    frames: Sequence[I420], preset: str, crfs: Sequence[float], quality: Quality
 ) -> tuple[RatePoint, ...]:
-    """Code each frame as an I picture at each CRF; one point per CRF, best quality first.
+    """Code each frame as an I picture at each CRF; return one point a CRF, best quality first.
 
     Bytes are those of the slices, without start codes. ``quality`` compares (decoded, frame) in
-    decibels and must be the measure the saving is asked for.
+    decibels; it must be the measure at which savings are then asked for.
 
     Raises ``InvalidInput`` without frames, or for what ``CodecConfig`` refuses.
     """
     if not frames:
         raise InvalidInput("frames", "an intra curve needs at least one frame")
-    return tuple(_point(frames, preset, crf, quality) for crf in sorted(crfs))
+    return tuple(_intra_point(frames, preset, crf, quality) for crf in sorted(crfs))
+
+
+def _intra_point(frames: Sequence[I420], preset: str, crf: float, quality: Quality) -> RatePoint:
+    config = CodecConfig(*frames[0].size_px, effort_of_preset(preset), crf)
+    options = EncoderOptions(config.coded_size_px, preset, crf, params={"keyint": "1"})
+    units = encode_pictures(options, [(frame, PictureKind.I) for frame in frames])
+    sizes = [sum(map(len, slice_nals(unit))) for unit in units]
+    decoder = H264Decoder(config.coded_size_px)
+    qualities = [
+        quality(decoder.decode(unit).cropped(config.size_px), frame)
+        for unit, frame in zip(units, frames, strict=True)
+    ]
+    return RatePoint(crf, float(np.mean(sizes)), float(np.mean(qualities)))
 
 
 def rival_curve(
@@ -120,19 +127,6 @@ def saving_at_equal_psnr(curve: Sequence[RatePoint], coded_bytes: float, psnr_db
     return 100.0 * (1.0 - coded_bytes / curve_bytes)
 
 
-def _point(frames: Sequence[I420], preset: str, crf: float, quality: Quality) -> RatePoint:
-    config = CodecConfig(*frames[0].size_px, effort_of_preset(preset), crf)
-    options = EncoderOptions(config.coded_size_px, preset, crf, params={"keyint": "1"})
-    units = encode_pictures(options, [(frame, PictureKind.I) for frame in frames])
-    sizes = [sum(map(len, slice_nals(unit))) for unit in units]
-    decoder = H264Decoder(config.coded_size_px)
-    qualities = [
-        quality(decoder.decode(unit).cropped(config.size_px), frame)
-        for unit, frame in zip(units, frames, strict=True)
-    ]
-    return RatePoint(crf, float(np.mean(sizes)), float(np.mean(qualities)))
-
-
 FrameAddress = tuple[int, int]
 """(epoch, sequence)"""
 INTRA_CRFS = (14.0, 18.0, 22.0, 26.0, 30.0, 34.0)
@@ -151,19 +145,18 @@ class Pictures:
 
 @dataclass(frozen=True)
 class DriveOutcome:
-    """What the processes reported of one drive, and how it was coded.
-
-    ``agent_rows``: one mapping a frame, in order, from the agent's report; ``server_digests``: the
-    digest of each picture the server wrote; ``link``: the link's report;
-    ``pictures``: the frames the server reconstructed; ``wrong_street``: a render of the same field
-    somewhere else.
-    """
+    """What the processes reported of one drive, and how it was coded."""
 
     agent_rows: Sequence[Mapping[str, Any]]
+    """The agent's report, a row a frame, in order."""
     server_digests: Mapping[FrameAddress, str]
+    """The digest of each picture that the server wrote."""
     link: Mapping[str, Any]
+    """The link's report."""
     pictures: Sequence[Pictures]
-    wrong_street: Rgb
+    """The frames that the server reconstructed."""
+    elsewhere: Rgb
+    """A render of the same field at another place."""
     preset: str
     crf: float
     rate_hz: float
@@ -180,15 +173,15 @@ class FrameFigures:
     psnr_db: float
     ssim: float
     rf_psnr_db: float
-    """Of the render, as ``rf_psnr_db`` of a drive."""
+    """PSNR of the render alone."""
     latency_ms: float
-    """From the picture in memory to its Ack."""
+    """Time from the picture in memory to its Ack."""
     stage_ms: Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class DriveFigures:
-    """One drive. Bytes are sums, qualities means over the frames that were reconstructed."""
+    """One drive: bytes are sums, qualities are means over the frames that were reconstructed."""
 
     frames: int
     frames_reconstructed: int
@@ -201,19 +194,21 @@ class DriveFigures:
     ssim: float
     rf_psnr_db: float
     paper_savings_percent: float
-    """100 I / (I + P) of a two-frame clip; below, with renders that know nothing of the place."""
+    """100 I / (I + P) of a two-frame clip, with the field's render as I."""
     paper_savings_percent_wrong_street: float
+    """The same with a render of another place, and below with a grey picture."""
     paper_savings_percent_grey: float
     saving_vs_intra_percent: float
-    """At equal PSNR against I pictures."""
+    """Saving at equal PSNR against I pictures."""
     latency_ms: Mapping[str, float]
-    """By percentile, ``p50`` and ``p99``."""
+    """Percentiles ``p50`` and ``p99``."""
     link_tau_error_percent: float
+    """The link's busy time against bytes / throughput."""
     stage_ms: Mapping[str, float]
-    """Medians."""
+    """Median of each stage."""
     per_frame: Sequence[FrameFigures]
     saving_vs_x264_percent: float
-    """At equal PSNR against low-delay x264."""
+    """Saving at equal PSNR against low-delay x264."""
     x264_setting: str
 
 
@@ -226,7 +221,8 @@ def measure_drive(outcome: DriveOutcome) -> DriveFigures:
     frames = [_measure_frame(rows[pictures.name], pictures) for pictures in outcome.pictures]
     packet_bytes = sum(frame.packet_bytes for frame in frames)
     psnr_db = statistics.fmean(frame.psnr_db for frame in frames)
-    rivals = Rivals.of(outcome)
+    cameras = [pictures.camera for pictures in outcome.pictures]
+    rivals = Rivals(cameras, outcome.preset, outcome.rate_hz)
     return DriveFigures(
         frames=len(rows),
         frames_reconstructed=len(outcome.pictures),
@@ -270,44 +266,32 @@ def _digest_matches(outcome: DriveOutcome) -> int:
 
 
 def _published_metric(outcome: DriveOutcome) -> dict[str, float]:
-    """The paper's figure, with the render and with two renders that know nothing of the place."""
-    grey = np.full_like(outcome.wrong_street, 128)
-    savings: dict[str, list[float]] = {"render": [], "wrong_street": [], "grey": []}
+    """Return the paper's figure with the render, and with two that know nothing of the place."""
+    grey = np.full_like(outcome.elsewhere, 128)
+    savings: dict[str, list[float]] = {"": [], "_wrong_street": [], "_grey": []}
     for pictures in outcome.pictures:
         camera = i420_from_rgb(pictures.camera)
-        stand_ins = {
-            "render": pictures.render,
-            "wrong_street": outcome.wrong_street,
-            "grey": grey,
-        }
-        for name, picture in stand_ins.items():
-            savings[name].append(
-                paper_savings_percent(camera, i420_from_rgb(picture), outcome.preset, outcome.crf)
+        references = (pictures.render, outcome.elsewhere, grey)
+        for reference, found in zip(references, savings.values(), strict=True):
+            found.append(
+                paper_savings_percent(camera, i420_from_rgb(reference), outcome.preset, outcome.crf)
             )
     return {
-        "paper_savings_percent": statistics.fmean(savings["render"]),
-        "paper_savings_percent_wrong_street": statistics.fmean(savings["wrong_street"]),
-        "paper_savings_percent_grey": statistics.fmean(savings["grey"]),
+        f"paper_savings_percent{name}": statistics.fmean(found) for name, found in savings.items()
     }
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """The camera frames of a drive, coded by others at the drive's preset and rate."""
+    """The camera frames of a drive, coded by other encoders at the drive's preset and rate."""
 
     cameras: Sequence[Rgb]
     preset: str
     rate_hz: float
 
-    @staticmethod
-    def of(outcome: DriveOutcome) -> Rivals:
-        """Return the rivals of what a drive sent."""
-        cameras = [pictures.camera for pictures in outcome.pictures]
-        return Rivals(cameras, outcome.preset, outcome.rate_hz)
-
     @property
     def x264(self) -> Rival:
-        """Low-delay x264, tuned for the measure it is compared by."""
+        """Low-delay x264, tuned for the measure of the comparison."""
         return x264_for_psnr(self.preset)
 
     def saving_vs_intra(self, packet_bytes: float, psnr_db: float) -> float:
@@ -319,7 +303,7 @@ class Rivals:
         return saving_at_equal_psnr(curve, packet_bytes, psnr_db)
 
     def saving_vs_x264(self, packet_bytes: float, psnr_db: float) -> float:
-        """Return the bytes saved against x264 likewise; every frame counts, the first too."""
+        """Return the bytes saved against low-delay x264; every frame counts, the first too."""
         curve = rival_curve(self._frames, self.x264, self.rate_hz, X264_CRFS, self._rgb_psnr_db)
         return saving_at_equal_psnr(curve, packet_bytes, psnr_db)
 

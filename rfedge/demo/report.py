@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.console import Console
 from rich.table import Table
 
@@ -43,19 +43,6 @@ def figures_of(result: Result) -> dict[str, DriveFigures]:
     return dict(zip(sequences, drives, strict=True))
 
 
-def _of_frames(count: int, drive: DriveFigures) -> str:
-    return f"{count} of {drive.frames}"
-
-
-def _kilobytes(drive: DriveFigures) -> str:
-    sizes = (drive.payload_bytes, drive.packet_bytes, drive.wire_bytes)
-    return " / ".join(f"{size / 1e3:.1f}" for size in sizes)
-
-
-def _latency(drive: DriveFigures) -> str:
-    return f"{drive.latency_ms['p50']:.0f} / {drive.latency_ms['p99']:.0f} ms"
-
-
 SUMMARY: tuple[tuple[str, str, Callable[[DriveFigures], str]], ...] = (
     (
         "Saving against low-delay x264",
@@ -70,12 +57,12 @@ SUMMARY: tuple[tuple[str, str, Callable[[DriveFigures], str]], ...] = (
     (
         "Frames reconstructed",
         "of those sent",
-        lambda drive: _of_frames(drive.frames_reconstructed, drive),
+        lambda drive: f"{drive.frames_reconstructed} of {drive.frames}",
     ),
     (
         "Digests that match",
         "server's picture = vehicle's closed loop, byte for byte",
-        lambda drive: _of_frames(drive.digest_matches, drive),
+        lambda drive: f"{drive.digest_matches} of {drive.frames}",
     ),
     (
         "Quality of the reconstruction",
@@ -83,13 +70,24 @@ SUMMARY: tuple[tuple[str, str, Callable[[DriveFigures], str]], ...] = (
         lambda drive: f"{drive.psnr_db:.2f} dB; {drive.ssim:.3f}",
     ),
     ("Quality of the render alone", "mean RGB PSNR", lambda drive: f"{drive.rf_psnr_db:.2f} dB"),
-    ("Payload / packet / wire", "kB over the drive", _kilobytes),
+    (
+        "Payload / packet / wire",
+        "kB over the drive",
+        lambda drive: (
+            f"{drive.payload_bytes / 1e3:.1f} / {drive.packet_bytes / 1e3:.1f} / "
+            f"{drive.wire_bytes / 1e3:.1f}"
+        ),
+    ),
     (
         "Savings as published",
         "100·I/(I+P) of a two-frame clip",
         lambda drive: f"{drive.paper_savings_percent:.1f} %",
     ),
-    ("Latency", "picture in memory to acknowledged, p50 / p99", _latency),
+    (
+        "Latency",
+        "picture in memory to acknowledged, p50 / p99",
+        lambda drive: f"{drive.latency_ms['p50']:.0f} / {drive.latency_ms['p99']:.0f} ms",
+    ),
     (
         "Link timing error",
         "measured busy time against bytes / throughput",
@@ -105,7 +103,7 @@ METRIC: tuple[tuple[str, Callable[[DriveFigures], float]], ...] = (
     ),
     ("a grey picture", lambda drive: drive.paper_savings_percent_grey),
 )
-"""The published metric with renders that know ever less of the place."""
+"""The published metric with references that show ever less of the place."""
 
 
 def print_summary(console: Console, result: Result, out: Path) -> None:
@@ -122,6 +120,9 @@ def print_summary(console: Console, result: Result, out: Path) -> None:
         console.print(f"  {out / name}")
 
 
+PROVENANCE = ("command", "revision", "dirty", "host", "settings", "field")
+
+
 def write_report(
     path: Path,
     result: Result,
@@ -134,7 +135,10 @@ def write_report(
     ``video`` an MP4 file to embed.
     """
     drives = figures_of(result)
-    page = _template("report.html.j2").render(
+    environment = Environment(
+        loader=PackageLoader("rfedge.demo", "."), autoescape=True, undefined=StrictUndefined
+    )
+    page = environment.get_template("report.html.j2").render(
         headline=_headline(drives),
         gain=DIFFERENCE_GAIN,
         video=base64.b64encode(video.read_bytes()).decode() if video is not None else None,
@@ -148,20 +152,9 @@ def write_report(
             for label, show in METRIC
         ],
         sequences=[_sequence(name, drive, pictures[name]) for name, drive in drives.items()],
-        provenance=_provenance(result),
+        provenance=json.dumps({key: result[key] for key in PROVENANCE}, indent=2),
     )
     write_whole(path, page)
-
-
-def _template(name: str) -> Template:
-    loader = PackageLoader("rfedge.demo", ".")
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
-    return environment.get_template(name)
-
-
-def _provenance(result: Result) -> str:
-    keys = ("command", "revision", "dirty", "host", "settings", "field")
-    return json.dumps({key: result[key] for key in keys}, indent=2)
 
 
 def _headline(drives: Mapping[str, DriveFigures]) -> str:

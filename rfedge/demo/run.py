@@ -1,4 +1,4 @@
-"""Orchestrate the demo: field, processes, measurements, and what is left on disk."""
+"""Run the demo: its field, its processes, its measurements, and the files it leaves."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ DRIVES = ("empty", "vehicles")
 VEHICLE = "demo"
 CAMERA = "front"
 RECORDED = "recorded"
-"""Folder of what the server reconstructed of a drive, as a dataset."""
+"""Folder of the pictures that the server reconstructed of a drive, as a dataset."""
 DRIVE_TIMEOUT_S = 300.0
 
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """What the demo runs with; units in the names."""
+    """Settings of the demo; see ``rfedge demo --help``."""
 
     sample: Path
     out: Path
@@ -82,7 +82,7 @@ class DemoRun:
     field: Path
 
     def twin_command(self, out: Path) -> str:
-        """Return what shows the last drive in a browser: field, and what the server made of it."""
+        """Return the command that shows the field and the last drive's pictures in a browser."""
         recorded = out / "work" / DRIVES[-1] / RECORDED
         return shlex.join(("rfedge", "twin", str(self.field), "--drive", str(recorded)))
 
@@ -104,17 +104,17 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     """
     console.print(f"[bold]Sample[/] {settings.sample}: verifying")
     verify_manifest(settings.sample)
-    refuse_foreign_folder(settings.out)
+    _refuse_foreign_folder(settings.out)
     choice = FieldChoice(settings.sample, settings.cache, settings.training, settings.train_anew)
     field_path = choose_field(choice, console)
-    empty_folder(settings.out)
+    shutil.rmtree(settings.out, ignore_errors=True)
     field = load_field(field_path, threads=settings.threads)
-    wrong_street = _wrong_street(settings.sample, field)
+    elsewhere = _elsewhere(settings.sample, field)
     sequences: dict[str, DriveFigures] = {}
     pictures: dict[str, list[Pictures]] = {}
     for drive in DRIVES:
         console.print(f"[bold]Drive[/] {drive}: server, link and vehicle as processes")
-        outcome = _drive_outcome(settings, drive, field_path, field, wrong_street)
+        outcome = _drive_outcome(settings, drive, field_path, field, elsewhere)
         sequences[drive] = measure_drive(outcome)
         pictures[drive] = list(outcome.pictures)
     result = _result(settings, field, sequences)
@@ -125,7 +125,7 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     return DemoRun(result, pictures, field_path)
 
 
-def refuse_foreign_folder(folder: Path) -> None:
+def _refuse_foreign_folder(folder: Path) -> None:
     """Raise ``InvalidInput`` for a folder whose content no demo made: it would be deleted."""
     content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     if content - {"work"} and "result.json" not in content:
@@ -134,20 +134,14 @@ def refuse_foreign_folder(folder: Path) -> None:
         )
 
 
-def empty_folder(folder: Path) -> None:
-    """Leave nothing in a demo's folder but an empty ``work``."""
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / "work").mkdir(parents=True)
-
-
 def _drive_outcome(
-    settings: DemoSettings, drive: str, field_path: Path, field: RadianceField, wrong_street: Rgb
+    settings: DemoSettings, drive: str, field_path: Path, field: RadianceField, elsewhere: Rgb
 ) -> DriveOutcome:
     work = settings.out / "work" / drive
     work.mkdir(parents=True)
     drive_path = settings.sample / f"transforms_drive_{drive}.json"
     _run_processes(settings, drive_path, field_path, field.field_id, work)
-    agent_rows = json_lines(work / "agent.jsonl")
+    agent_rows = _json_lines(work / "agent.jsonl")
     parts = [read_recorded_part(file) for file in recordings_under(work / RECORDED)]
     recorded = {(r.epoch, r.sequence): (part, r) for part in parts for r in part.pictures}
     dataset = read_dataset(drive_path)
@@ -163,7 +157,7 @@ def _drive_outcome(
             agent_rows,
             {address: part.path(row) for address, (part, row) in recorded.items()},
         ),
-        wrong_street=wrong_street,
+        elsewhere=elsewhere,
         preset=settings.preset,
         crf=settings.crf,
         rate_hz=settings.rate_hz,
@@ -175,7 +169,7 @@ def _run_processes(
 ) -> None:
     server_command = [
         *command_of("mec-server"),
-        *("--fields", str(field_path.parent), "--record", str(work / "recorded")),
+        *("--fields", str(field_path.parent), "--record", str(work / RECORDED)),
         *("--listen", "127.0.0.1:0", "--threads", str(settings.threads)),
     ]
     with service("mec-server", server_command, work) as server:
@@ -202,7 +196,7 @@ def _address(row: Mapping[str, Any]) -> FrameAddress:
     return (row["epoch"], row["sequence"])
 
 
-def json_lines(path: Path) -> list[dict[str, Any]]:
+def _json_lines(path: Path) -> list[dict[str, Any]]:
     """Return a report's lines that are whole; raise ``RfedgeError`` if there is none."""
     if not path.exists():
         raise RfedgeError(f"{path} was not written: the processes reported nothing")
@@ -222,7 +216,7 @@ def _pictures(
         Pictures(
             row["name"],
             posed[row["name"]].read(),
-            rendered(field, posed[row["name"]].camera),
+            _rendered(field, posed[row["name"]].camera),
             read_rgb(recorded[_address(row)]),
         )
         for row in agent_rows
@@ -230,13 +224,13 @@ def _pictures(
     ]
 
 
-def rendered(field: RadianceField, camera: Camera) -> Rgb:
-    """The render as the codec sees it: through YUV 4:2:0 and back."""
+def _rendered(field: RadianceField, camera: Camera) -> Rgb:
+    """Return the render as the codec sees it: through YUV 4:2:0 and back."""
     return rgb_from_i420(render_field_view(field, camera).render)
 
 
-def _wrong_street(sample: Path, field: RadianceField) -> Rgb:
-    """A render of the same field from a training view far from the drive."""
+def _elsewhere(sample: Path, field: RadianceField) -> Rgb:
+    """Return a render of the field at the training view that is farthest from the drive."""
     train = read_dataset(sample / "transforms_train.json")
     drive = read_dataset(sample / f"transforms_drive_{DRIVES[0]}.json")
     start = drive.pictures[0].camera.world_from_cam.translation_m
@@ -247,7 +241,7 @@ def _wrong_street(sample: Path, field: RadianceField) -> Rgb:
             for a, b in zip(view.camera.world_from_cam.translation_m, start, strict=True)
         ),
     )
-    return rendered(field, farthest.camera)
+    return _rendered(field, farthest.camera)
 
 
 def _result(

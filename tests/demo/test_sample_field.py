@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from lab.sample_field import MAX_BYTES
 from rfcore.dataset import read_dataset
 from rfcore.field import Quality, SplatField, load_field
 from rfcore.field.store import encode_field
 from rfcore.train import DensityControl, SplatTrainingConfig, mean_psnr_db
-from rfedge.demo.field import MAX_BYTES, check_sample_field, sample_field_path
+from rfedge.demo.field import check_sample_field, sample_field_path
 from rfedge.training.run import TrainingJob, train_field
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
