@@ -1,15 +1,14 @@
-"""The codec without a network: frame by frame, and a drive into a ``.rfv`` file and back.
+"""Encode and decode without a network: frame by frame, or a drive into a ``.rfv`` file and back.
 
-``encode_frames`` and ``decode_frames`` are the loops of whoever codes a clip in one process. Both
-are generators: what is between them (a list, or nothing) decides whether a frame is decoded before
-the next one is coded. A ``.rfv`` file holds the very messages a vehicle would send, so its size is
-the packets' size.
+``encode_frames`` and ``decode_frames`` code a clip in one process. Both are generators, so the
+caller decides whether a frame is decoded before the next one is coded. A ``.rfv`` file holds the
+messages that a vehicle would send, so its size is the size of the packets.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import tee
 
 from rfcore.codec.decoder import DeltaDecoder
@@ -48,32 +47,29 @@ __all__ = [
 OFFLINE_VEHICLE = "offline"
 CAMERA_ID = "front"
 RENDERER = RendererContract(RENDERER_CONTRACT, exact=True)
-FITTING = FrameChoice(limit_bytes=MAX_PAYLOAD_BYTES)
-LEFT_TO_THE_ENCODER = FrameChoice()
+DEFAULT_CHOICE = FrameChoice()
 Locate = Callable[[PosedPicture, I420], FieldView | None]
-"""Finds a picture's pose: what the field shows there, None if the camera is lost."""
+"""Finds a picture's pose; returns the field's view there, or None if the camera is lost."""
 EPOCH = 1
-"""Of a stream that is coded and decoded in one go."""
+"""A clip that is coded in one go has this one epoch."""
 
 
 @dataclass(frozen=True)
 class FrameInput:
-    """A frame to code, with what the field shows at its pose, and how it is to be coded.
-
-    ``costs`` are those of the frame's blocks, as far as they are known already. ``lost``: its pose
-    is not known, and it is coded without the field.
-    """
+    """A frame to code, with the field's view at its pose, and how to code it."""
 
     frame: I420
     view: FieldView
-    choice: FrameChoice = LEFT_TO_THE_ENCODER
+    choice: FrameChoice = DEFAULT_CHOICE
     costs: FrameCosts | None = None
+    """Costs of the frame's blocks, if they are known already."""
     lost: bool = False
+    """Whether its pose is unknown, so that it is coded without the field."""
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """A packet at the receiver, with what the field shows at the packet's pose."""
+    """A packet at the receiver, with the field's view at the packet's pose."""
 
     packet: DeltaPacket
     view: FieldView
@@ -81,21 +77,21 @@ class Arrival:
 
 @dataclass(frozen=True)
 class CodedFrame:
-    """A frame and what the encoder made of it."""
+    """A frame and its coded form."""
 
     given: FrameInput
     encoded: Encoded
 
     @property
     def arrival(self) -> Arrival:
-        """The packet as a receiver of the same field gets it."""
+        """The packet as a receiver with the same field gets it."""
         return Arrival(self.encoded.packet, self.given.view)
 
 
 def encode_frames(encoder: DeltaEncoder, inputs: Iterable[FrameInput]) -> Iterator[CodedFrame]:
     """Code one frame after another, each from the state that the one before it left.
 
-    An input is asked for when its frame is coded, not earlier. Raises as ``DeltaEncoder.encode``.
+    An input is taken only when its frame is coded. Raises as ``DeltaEncoder.encode``.
     """
     state = encoder.start(EPOCH)
     for given in inputs:
@@ -111,10 +107,10 @@ def decode_frames(
     *,
     skip_rejected: bool = False,
 ) -> Iterator[I420 | None]:
-    """Decode one packet after another; None stands for one that was lost, and yields None.
+    """Decode one packet after another; None stands for a packet that was lost, and yields None.
 
-    ``PacketRejected`` ends the loop, unless ``skip_rejected``: then a packet that the decoder
-    refuses yields None and leaves its state as it was, as a receiver's that asks for another one.
+    Raises ``PacketRejected`` for a packet that the decoder refuses. With ``skip_rejected`` such a
+    packet yields None and leaves the decoder's state as it was.
     """
     state = decoder.start()
     for arrival in arrivals:
@@ -132,25 +128,27 @@ def decode_frames(
 def decode_promised(
     decoder: DeltaDecoder, coded: Iterable[CodedFrame]
 ) -> Iterator[tuple[CodedFrame, I420]]:
-    """Decode every coded frame; raise ``CodecError`` if one is not what its sender promised."""
+    """Decode every coded frame; raise ``CodecError`` if one differs from the sender's own."""
     frames, sent = tee(coded)
     pictures = decode_frames(decoder, (frame.arrival for frame in sent))
     for index, (frame, picture) in enumerate(zip(frames, pictures, strict=True)):
         promised = frame.encoded.reconstruction
         if picture is None or picture.digest() != promised.digest():
-            raise CodecError(f"frame {index} decodes to another picture than was promised")
+            raise CodecError(f"frame {index} decodes to another picture than its sender's")
         yield frame, picture
 
 
 @dataclass(frozen=True)
 class CodingSettings:
-    """How the P pictures are coded: an effort, a constant rate factor (1..51), and where;
-    ``check_decode`` as in ``DeltaEncoder``."""
+    """How the P pictures of a drive are coded."""
 
     effort: str = DEFAULT_EFFORT
     crf: float = 23.0
+    """Constant rate factor, 1..51."""
     steering: Steering = NO_STEERING
+    """Where in the picture frames are coded finer or coarser."""
     check_decode: bool = False
+    """As in ``DeltaEncoder``."""
     light: LightChange = LightChange.AUTO
     """Whether the light of renders is changed where that saves bits."""
 
@@ -171,15 +169,30 @@ def encode_drive(
 ) -> CodedDrive:
     """Code every picture of a drive against the field's render at its pose.
 
-    ``locate`` finds the poses; without it they are the dataset's.
+    ``locate`` finds the poses; without it they are the dataset's. Raises ``DatasetError`` if the
+    pictures are not all of one camera, ``CodecError`` for a picture whose slice is too long for a
+    message at every CRF.
 
-    Raises ``DatasetError`` if the pictures are not all of one camera, ``CodecError`` for a picture
-    whose slice is too long for a message at every CRF.
+    Three pictures into packets, and back into the very pictures that the sender decoded::
+
+        >>> from dataclasses import replace
+        >>> from pathlib import Path
+        >>> from rfcore.dataset import read_dataset
+        >>> from rfcore.field import load_field
+        >>> from rfedge.offline import CodingSettings, decode_drive, encode_drive
+        >>> field = load_field(Path("samples/fields/street.rff"))
+        >>> drive = read_dataset(Path("samples/street/transforms_drive_empty.json"))
+        >>> drive = replace(drive, pictures=drive.pictures[:3])
+        >>> coded = encode_drive(drive, field, CodingSettings(crf=26))
+        >>> sum(len(frame.packet.payload) for frame in coded.frames) < 40_000
+        True
+        >>> for decoded, sent in zip(decode_drive(coded, field), coded.frames):
+        ...     assert decoded.frame.digest() == sent.packet.reconstruction_digest
     """
     intrinsics = dataset.pictures[0].camera.intrinsics
     config = CodecConfig(intrinsics.width_px, intrinsics.height_px, settings.effort, settings.crf)
     encoder = DeltaEncoder(config, check_decode=settings.check_decode)
-    coded_frames = encode_frames(encoder, _placed(dataset, field, settings, locate))
+    coded_frames = encode_frames(encoder, _inputs(dataset, field, settings, locate))
     frames = []
     for picture, coded in zip(dataset.pictures, coded_frames, strict=True):
         _require_fit(picture.name, coded.encoded)
@@ -189,13 +202,17 @@ def encode_drive(
     return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
 
 
-def _placed(
+def _inputs(
     dataset: Dataset, field: RadianceField, settings: CodingSettings, locate: Locate | None
 ) -> Iterator[FrameInput]:
-    """Read one picture after another and render the field at the pose it is coded at."""
+    """Read one picture after another and render the field at its pose."""
     intrinsics = dataset.pictures[0].camera.intrinsics
     photometric = () if settings.light is LightChange.OFF else None
-    choice = replace(FITTING, qp_map=settings.steering.qp_map, photometric=photometric)
+    choice = FrameChoice(
+        limit_bytes=MAX_PAYLOAD_BYTES,
+        qp_map=settings.steering.qp_map,
+        photometric=photometric,
+    )
     for picture in dataset.pictures:
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
@@ -225,7 +242,7 @@ def decode_drive(
     """Reconstruct every frame, in order, with a decoder that ``open_decoder`` makes.
 
     Raises ``InvalidData`` if the drive was coded against another field, ``PacketRejected`` at the
-    first packet that fails a check.
+    first packet that fails a check. ``encode_drive`` has an example.
     """
     if field.field_id not in drive.hello.field_ids:
         raise InvalidData(
@@ -233,10 +250,7 @@ def decode_drive(
         )
     camera = drive.hello.cameras[0]
     arrivals = (
-        Arrival(
-            frame.packet,
-            camera.posed(frame).view(field, camera.intrinsics),
-        )
+        Arrival(frame.packet, camera.posed(frame).view(field, camera.intrinsics))
         for frame in drive.frames
     )
     decoder = DeltaDecoder(camera.codec, open_decoder=open_decoder)

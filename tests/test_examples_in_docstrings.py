@@ -13,6 +13,7 @@ EXAMPLES = (
     "rfcore.link.shaper.Link",
     "rfcore.localise.localiser.Localiser",
     "rfcore.wire.drive_file.read_drive",
+    "rfedge.offline.encode_drive",
 )
 
 
