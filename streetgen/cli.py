@@ -1,15 +1,16 @@
-"""The ``streetgen`` command line: build, plan and sheet declared streets.
+"""The ``streetgen`` command line.
 
-A scene file becomes pictures, depth, classes and poses. ``plan`` says what a scene declares and
-what its effects cost, ``sheet`` puts built scenes on one page.
+``build`` renders a scene file into pictures, depth, classes and poses. ``plan`` says what a scene
+declares and what its effects cost. ``sheet`` puts pictures of built scenes on one page.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg, subcommand
@@ -17,22 +18,19 @@ from tyro.conf import Positional, arg, subcommand
 from rfedge.arguments import FOLDER, JSON, SCENE, SIZE, parse_size
 from rfedge.program import CONFIG, run_program
 
-if TYPE_CHECKING:
-    from streetgen.scene_file import Scene
-
 __all__ = ["Build", "Plan", "Sheet", "main", "parse"]
 
 
 @dataclass(frozen=True)
 class Build:
-    """Render a scene with Mitsuba 3 (pip install 'rfedge[scene]') into a dataset.
+    """Render a scene with Mitsuba 3 into a dataset.
 
     The same command goes on where it was stopped. The same scene, size, samples and seed give the
     same pictures, whatever the number of workers.
     """
 
     scene: Annotated[str, Positional, SCENE]
-    """A ready-made scene by name (samples/scenes), or a scene file (.toml)."""
+    """A ready-made scene by name (such as street-empty), or a scene file (.toml)."""
     out: Annotated[Path, FOLDER]
     """The folder to make, or to go on with."""
     size: Annotated[str | None, SIZE] = None
@@ -44,9 +42,6 @@ class Build:
     LLVM and scalar. Pictures of two differ by rounding, so a folder is built by one."""
     workers: int = 1
     """Processes. One uses all cores; more share them and take 1 to 2.5 GB each."""
-    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Render on a Ray (`local` starts one here; docs/how-to/servers.md), each job on this machine's
-    cores divided by --workers; the pictures are the same. Needs rfedge[ray]."""
     frames: Annotated[str | None, arg(metavar="A:B")] = None
     """Only frames a:b of the chosen splits, counted through drive, train, eval in that order."""
     split: Annotated[str, arg(metavar="SPLIT")] = "default"
@@ -59,25 +54,19 @@ class Build:
     right and back."""
 
     def run(self) -> None:
-        """Build."""
+        """Build the dataset, or go on with it."""
         from rich.console import Console
 
-        from rfcore.extras import require
         from streetgen import load_scene
-        from streetgen.render.backend import require_renderer
-        from streetgen.shots import Selection
-
-        require_renderer()
         from streetgen.build.run import Settings, build_scene
+        from streetgen.shots import Selection
 
         size_px = parse_size(self.size) if self.size is not None else None
         scene = load_scene(self.scene)
         if self.rig is not None:
             scene = replace(scene, drive=replace(scene.drive, rig=self.rig))
         selection = Selection(scene, self.split, self.frames, size_px)
-        if self.ray is not None:
-            require("ray", "ray")
-        settings = Settings(self.out, self.spp, self.workers, self.ray, self.renderer)
+        settings = Settings(self.out, self.spp, self.workers, self.renderer)
         build_scene(selection, settings, Console(soft_wrap=True))
 
 
@@ -86,64 +75,36 @@ class Plan:
     """Check scene files; print their pictures and the effects that will run, with measured cost."""
 
     scenes: Annotated[tuple[str, ...], Positional, arg(metavar="SCENE ...")]
-    """Ready-made scenes by name (samples/scenes), or scene files (.toml)."""
+    """Ready-made scenes by name, or scene files (.toml)."""
 
     render: bool = False
     """Render the street small, with and without each effect, and say what share of a frame each
-    takes; needs rfedge[scene] and up to a minute for each effect."""
+    takes; up to a minute for each effect."""
     json: Annotated[Path | None, JSON] = None
     """With --render: also write what was measured into this file."""
-    page: Annotated[Path | None, arg(metavar="FILE.md")] = None
-    """With --render: also put it as a table into this page, between its marks."""
 
     def run(self) -> None:
         """Print the plans."""
+        from time import process_time
+
         from rfcore.errors import InvalidInput
         from streetgen import load_scene
+        from streetgen.plan import Planner, small_render_ms, write_rows
 
         if not self.scenes:
             raise InvalidInput("scenes", "none is named; street-empty is one")
-        if not self.render and (self.json or self.page):
-            raise InvalidInput("json", "and page take what was rendered; add --render")
+        if self.json and not self.render:
+            raise InvalidInput("json", "takes what was rendered; add --render")
         scenes = [load_scene(name) for name in self.scenes]
-        if self.render:
-            self._measure(scenes)
-        else:
-            _print_plans(scenes)
-
-    def _measure(self, scenes: list[Scene]) -> None:
-        from time import process_time
-
-        from streetgen.plan_table import (
-            effect_lines,
-            measured_plans,
-            scene_lines,
-            write_page,
-            write_rows,
-        )
-        from streetgen.render.backend import require_renderer
-
-        require_renderer()
+        render = partial(small_render_ms, cpu_s=process_time) if self.render else None
+        planner = Planner(process_time, render)
         rows = []
-        for plan in measured_plans(scenes, process_time):
-            print(*scene_lines(plan.scene), sep="\n")
-            print(*effect_lines(plan.effects, plan.cost), sep="\n", flush=True)
-            rows += plan.rows()
+        for scene in scenes:
+            plan = planner.plan(scene)
+            print(*plan.lines(), sep="\n", flush=True)
+            rows += plan.rows() if self.render else []
         if self.json is not None:
             write_rows(self.json, rows)
-        if self.page is not None:
-            write_page(self.page, rows)
-
-
-def _print_plans(scenes: list[Scene]) -> None:
-    from time import process_time
-
-    from streetgen.plan import planned_effects
-    from streetgen.plan_table import effect_lines, scene_lines
-
-    for scene in scenes:
-        print(*scene_lines(scene), sep="\n")
-        print(*effect_lines(planned_effects(scene, process_time), None), sep="\n")
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,12 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import DatasetError, InvalidInput
-from rfcore.extras import needs
 from rfcore.files import write_whole
-
-with needs("scene"):
-    import cv2
 
 __all__ = ["contact_sheet", "write_contact_sheet"]
 

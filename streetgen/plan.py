@@ -1,115 +1,197 @@
-"""What a scene will run, and what each effect costs, measured on this machine.
+"""Say which effects a scene will run, and measure what each of them costs on this machine.
 
-Effects on frames are timed on a plain frame of the drive's size. Effects on the street run once,
-before the first frame; they are timed on the scene's own street, which is made only if there are
-any. What an effect on the street adds to rendering is the difference between small renders before
-and after it; the difference can be negative (a sky without a sun needs fewer samples of light).
-Scenes with the same street share the plain render.
+An effect on frames is timed on a plain frame of the drive's size. An effect on the street runs
+once, before the first frame, and is timed on the scene's own street. What it adds to rendering is
+the difference between small renders before and after it. That difference can be negative: a sky
+without a sun needs fewer samples of light.
+
+Shares are percentages of a whole frame of the drive with all effects.
 """
 
 from __future__ import annotations
 
+import shlex
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfedge.results import make_result, provenance, write_result
 from streetgen.assembly import plain_world
-from streetgen.effects import EFFECTS, Effect, EffectKind, rng_of
+from streetgen.effects import EFFECTS, Effect, rng_of
 from streetgen.frame import LinearFrame
 from streetgen.geometry.layout import Geometry
 from streetgen.geometry.world import World
 from streetgen.scene_file import Drive, Rig, Scene
 
 __all__ = [
-    "PlainStreets",
-    "PlannedEffect",
-    "RenderCost",
-    "measured_render",
+    "EffectCost",
+    "Planner",
+    "ScenePlan",
     "plain_frame",
-    "planned_effects",
     "small_render_ms",
+    "write_rows",
 ]
 
-
 REPETITIONS = 5
+FrameMs = Callable[[World], float]
+"""A measure of the processor time that a frame of a world takes to render, ms."""
 
 
 @dataclass(frozen=True)
-class PlannedEffect:
-    """An effect that will run, with its settings and its median processor time.
+class EffectCost:
+    """An effect and its processor time: ``once_ms`` before the first frame, then each frame.
 
-    ``each_frame``: whether that is spent in every frame, or once before the first.
+    ``frame_ms`` is None for an effect on the street whose street was not rendered.
     """
 
-    name: str
-    kind: EffectKind
-    why: str
-    settings: object
-    cost_ms: float
-    each_frame: bool = True
+    effect: Effect
+    once_ms: float
+    frame_ms: float | None
 
 
 @dataclass(frozen=True)
-class RenderCost:
-    """Processor milliseconds a frame of the drive: the plain street, and what each effect adds."""
+class ScenePlan:
+    """A scene and its effects. ``plain_ms`` is what a frame without effects takes, if measured."""
 
-    plain_ms: float
-    added_ms: dict[str, float]
+    scene: Scene
+    effects: tuple[EffectCost, ...]
+    plain_ms: float | None = None
 
-    def share_percent(self, cost_ms: float, frame_effects_ms: float) -> float:
-        """Return a cost's share of a whole frame with all effects."""
-        whole_ms = self.plain_ms + sum(self.added_ms.values()) + frame_effects_ms
-        return 100.0 * cost_ms / whole_ms
+    def lines(self) -> list[str]:
+        """Return a text of the pictures that the scene asks for, and a line for each effect."""
+        train, evaluation, drive = self.scene.train, self.scene.evaluation, self.scene.drive
+        cameras, stations = self.scene.rig.cameras, evaluation.stations
+        lines = [
+            f"{self.scene.name}: field of {self.scene.field}",
+            f"  train       {train.views} views of {_size(train.size_px)} px",
+            f"  evaluation  {stations * cameras} views of {_size(evaluation.size_px)} px "
+            f"({cameras} cameras, {stations} stations)",
+            f"  drive       {drive.frames} frames of {_size(drive.size_px)} px, "
+            f"{drive.rate_hz:g} Hz",
+        ]
+        if self.plain_ms is not None:
+            lines.append(
+                f"  render      {self.plain_ms:.0f} ms a frame without effects, "
+                f"{self._percent(self.plain_ms):.0f} % of it "
+                "(4 samples a pixel, 320x180 scaled to the drive's pixels, one core)"
+            )
+        if not self.effects:
+            lines.append("  effects     none: pictures are as rendered")
+        for cost in self.effects:
+            effect = cost.effect
+            lines.append(f"  {effect.kind:<11} {effect.name}: {effect.why}; {self._text(cost)}")
+        return lines
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row for the plain render and one for each effect; both must be measured."""
+        assert self.plain_ms is not None
+        rows = [self._row("", 0.0, self.plain_ms)]
+        for cost in self.effects:
+            assert cost.frame_ms is not None
+            rows.append(self._row(cost.effect.name, cost.once_ms, cost.frame_ms))
+        return rows
+
+    def _row(self, effect: str, once_ms: float, frame_ms: float) -> dict[str, Any]:
+        return {
+            "scene": self.scene.name,
+            "effect": effect,
+            "once_ms": round(once_ms, 1),
+            "frame_ms": round(frame_ms, 1),
+            "share_percent": round(self._percent(frame_ms), 2),
+        }
+
+    def _text(self, cost: EffectCost) -> str:
+        if cost.effect.on_frames:
+            of = "it" if self.plain_ms is not None else "all effects on frames"
+            digits = 1 if self.plain_ms is not None else 0
+            assert cost.frame_ms is not None
+            share = self._percent(cost.frame_ms)
+            return f"{cost.frame_ms:.1f} ms a frame, {share:.{digits}f} % of {of}"
+        once = f"{cost.once_ms:.0f} ms once, before the first frame"
+        if cost.frame_ms is None:
+            return once
+        return (
+            f"{once}; {cost.frame_ms:+.0f} ms a frame, {self._percent(cost.frame_ms):.1f} % of it"
+        )
+
+    def _percent(self, cost_ms: float) -> float:
+        whole_ms = (self.plain_ms or 0.0) + sum(cost.frame_ms or 0.0 for cost in self.effects)
+        return 100 * cost_ms / whole_ms if whole_ms else 0.0
 
 
-def planned_effects(
-    scene: Scene, cpu_s: Callable[[], float], world_of: Callable[[Scene], World] | None = None
-) -> tuple[PlannedEffect, ...]:
-    """Run each declared effect; ``cpu_s`` reads processor time.
+class Planner:
+    """Plans scenes one after another; scenes of the same street share its plain render.
 
-    ``world_of`` gives a scene's street without effects, where the caller has it.
+    ``cpu_s`` reads processor time. ``render`` returns a scene's measure of a frame; without it
+    nothing is rendered.
     """
-    declared = [effect for effect in EFFECTS if effect.name in scene.effects]
-    changes = [effect for effect in declared if not effect.on_frames]
-    frame = plain_frame(*scene.drive.size_px, scene.rig.fov_deg)
-    changed = _changed(scene, changes, cpu_s, world_of)
-    planned = [_planned(scene, effect, cost_ms) for effect, cost_ms in changed]
-    for effect in declared:
-        if effect.on_frames:
-            apply = scene.effects[effect.name].apply
-            times_s = []
-            for i in range(REPETITIONS):
-                start_s = cpu_s()
-                apply(frame, rng_of(effect, scene.geometry.seed, i))
-                times_s.append(cpu_s() - start_s)
-            planned.append(_planned(scene, effect, 1e3 * statistics.median(times_s)))
-    return tuple(planned)
 
+    def __init__(
+        self, cpu_s: Callable[[], float], render: Callable[[Scene], FrameMs] | None = None
+    ) -> None:
+        self._cpu_s = cpu_s
+        self._render = render
+        self._worlds: dict[Geometry, World] = {}
+        self._plain_ms: dict[tuple[Geometry, Rig, Drive], float] = {}
 
-def _changed(
-    scene: Scene,
-    changes: Sequence[Effect],
-    cpu_s: Callable[[], float],
-    world_of: Callable[[Scene], World] | None,
-) -> Iterator[tuple[Effect, float]]:
-    """Change the scene's street by one effect after the other, in milliseconds each."""
-    if not changes:
-        return
-    from streetgen.assembly import plain_world
+    def plan(self, scene: Scene) -> ScenePlan:
+        """Run each declared effect and return what it took."""
+        declared = [effect for effect in EFFECTS if effect.name in scene.effects]
+        frame_ms = None if self._render is None else self._render(scene)
+        plain_ms = None if frame_ms is None else self._plain(scene, frame_ms)
+        changes = [effect for effect in declared if not effect.on_frames]
+        costs = self._changes(scene, changes, frame_ms, plain_ms) if changes else []
+        frame = plain_frame(*scene.drive.size_px, scene.rig.fov_deg)
+        costs += [
+            EffectCost(effect, 0.0, self._apply_ms(scene, effect, frame))
+            for effect in declared
+            if effect.on_frames
+        ]
+        return ScenePlan(scene, tuple(costs), plain_ms)
 
-    world = (world_of or plain_world)(scene)
-    for effect in changes:
-        start_s = cpu_s()
-        world = scene.effects[effect.name].change(world, rng_of(effect, scene.geometry.seed, 0))
-        yield effect, 1e3 * (cpu_s() - start_s)
+    def _world(self, scene: Scene) -> World:
+        if scene.geometry not in self._worlds:
+            self._worlds[scene.geometry] = plain_world(scene)
+        return self._worlds[scene.geometry]
 
+    def _plain(self, scene: Scene, frame_ms: FrameMs) -> float:
+        key = (scene.geometry, scene.rig, scene.drive)
+        if key not in self._plain_ms:
+            self._plain_ms[key] = frame_ms(self._world(scene))
+        return self._plain_ms[key]
 
-def _planned(scene: Scene, effect: Effect, cost_ms: float) -> PlannedEffect:
-    settings = scene.effects[effect.name]
-    return PlannedEffect(effect.name, effect.kind, effect.why, settings, cost_ms, effect.on_frames)
+    def _changes(
+        self,
+        scene: Scene,
+        effects: Sequence[Effect],
+        frame_ms: FrameMs | None,
+        plain_ms: float | None,
+    ) -> list[EffectCost]:
+        """Change the scene's street by one effect after the other, and render it in between."""
+        world, before_ms, costs = self._world(scene), plain_ms, []
+        for effect in effects:
+            start_s = self._cpu_s()
+            world = scene.effects[effect.name].change(world, rng_of(effect, scene.geometry.seed, 0))
+            once_ms, added_ms = 1e3 * (self._cpu_s() - start_s), None
+            if frame_ms is not None and before_ms is not None:
+                after_ms = frame_ms(world)
+                added_ms, before_ms = after_ms - before_ms, after_ms
+            costs.append(EffectCost(effect, once_ms, added_ms))
+        return costs
+
+    def _apply_ms(self, scene: Scene, effect: Effect, frame: LinearFrame) -> float:
+        times_s = []
+        for i in range(REPETITIONS):
+            start_s = self._cpu_s()
+            scene.effects[effect.name].apply(frame, rng_of(effect, scene.geometry.seed, i))
+            times_s.append(self._cpu_s() - start_s)
+        return 1e3 * statistics.median(times_s)
 
 
 def plain_frame(width_px: int, height_px: int, fov_deg: float) -> LinearFrame:
@@ -133,49 +215,11 @@ SAMPLES = 4
 FRAMES = 3
 
 
-class PlainStreets:
-    """Streets without effects and what a frame of them takes, each made once."""
-
-    def __init__(self) -> None:
-        self._worlds: dict[Geometry, World] = {}
-        self._ms: dict[tuple[Geometry, Rig, Drive], float] = {}
-
-    def world(self, scene: Scene) -> World:
-        """Return the scene's street."""
-        if scene.geometry not in self._worlds:
-            self._worlds[scene.geometry] = plain_world(scene)
-        return self._worlds[scene.geometry]
-
-    def frame_ms(self, scene: Scene, measure: Callable[[World], float]) -> float:
-        """Return what a frame of it takes, measured when it is first asked for."""
-        key = (scene.geometry, scene.rig, scene.drive)
-        if key not in self._ms:
-            self._ms[key] = measure(self.world(scene))
-        return self._ms[key]
-
-
-def measured_render(
-    scene: Scene, frame_ms: Callable[[World], float], streets: PlainStreets
-) -> RenderCost:
-    """Render the scene's street plain and after each of its effects; ``frame_ms`` does it."""
-    plain_ms = before_ms = streets.frame_ms(scene, frame_ms)
-    world = streets.world(scene)
-    added_ms = {}
-    for effect in EFFECTS:
-        if effect.name in scene.effects and not effect.on_frames:
-            rng = rng_of(effect, scene.geometry.seed, 0)
-            world = scene.effects[effect.name].change(world, rng)
-            after_ms = frame_ms(world)
-            added_ms[effect.name] = after_ms - before_ms
-            before_ms = after_ms
-    return RenderCost(plain_ms, added_ms)
-
-
-def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World], float]:
+def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> FrameMs:
     """Return a measure of a world: the median of 3 frames of 320x180, 4 samples a pixel.
 
-    It is scaled to the pixels of the drive's frames, but for what moving vehicles take; samples are
-    not scaled.
+    It is scaled to the pixels of the drive's frames, except for the time that moving vehicles take;
+    samples are not scaled.
     """
     from streetgen.render.backend import chosen_backend
     from streetgen.render.renderer import Renderer, Sampling
@@ -198,3 +242,13 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World
         return 1e3 * statistics.median(times_s[1:] or times_s)
 
     return frame_ms
+
+
+def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write the rows with the command, the revision and the host that they come from."""
+    made = provenance(command=shlex.join(["streetgen", *sys.argv[1:]]))
+    write_result(path, make_result("scene-plan", made, {"rows": list(rows)}))
+
+
+def _size(size_px: tuple[int, int]) -> str:
+    return "{}x{}".format(*size_px)

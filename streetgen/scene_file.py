@@ -1,9 +1,9 @@
-"""Scene files: the street, where cameras drive, which pictures are taken, which effects run.
+"""Read scene files: the street, where cameras drive, which pictures are taken, which effects run.
 
-``samples/scenes/NAME.toml`` holds the ready-made ones. A scene runs exactly the effects it names in
-``[effects.<name>]`` (``streetgen.effects``). A scene of several ``[[passes]]`` is that many
-drives through one street, each with its own ``lane_offset_m`` and its own effects beside the
-scene's; ``NAME:2`` is the second of them, ``NAME`` the first.
+``streetgen/scenes/NAME.toml`` holds the ready-made ones. A scene runs exactly the effects that it
+names in ``[effects.<name>]`` (``streetgen.effects``). A scene with several ``[[passes]]`` describes
+as many drives through one street. Each has its own ``lane_offset_m``, and its own effects beside
+those of the scene; ``NAME:2`` is the second of them, ``NAME`` the first.
 
 Each table of the file becomes a frozen dataclass (``read_record``). A field's type is ``bool``,
 ``int``, ``float``, ``str`` or a tuple of numbers; ``Annotated`` metadata holds its ``Range`` or
@@ -23,7 +23,6 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 from rfcore.dataset.mounts import mounts_named
 from rfcore.errors import InvalidInput
 from rfcore.tables import Range, Table
-from rfedge.samples import sample_path
 from streetgen.effects import EFFECTS, EffectKind, load_effect
 from streetgen.geometry.layout import Geometry
 
@@ -127,7 +126,7 @@ def _lines_of_keys(text: str) -> dict[str, int]:
     return found
 
 
-SCENES = sample_path("scenes")
+SCENES = Path(__file__).parent / "scenes"
 PASS_MARK = ":"
 LANE_OFFSET_M = Range(-5, 5)
 Size = Annotated[tuple[int, int], Range(16, 8192)]

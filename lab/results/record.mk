@@ -75,7 +75,7 @@ endif
 SCENES := $(OUT)/scenes
 drive = $(SCENES)/$1/transforms_drive.json
 COMMA := ,
-effects = (cat samples/street/empty.toml; echo; awk -v RS= -v ORS='\n\n' '/^\[effects$2/' samples/scenes/$1.toml) >$@
+effects = (cat samples/street/empty.toml; echo; awk -v RS= -v ORS='\n\n' '/^\[effects$2/' streetgen/scenes/$1.toml) >$@
 lane = (cat samples/street/empty.toml; echo 'lane_offset_m = $1') >$@
 
 $(SCENES):
@@ -210,7 +210,7 @@ $(OUT)/benchmark.json: $(OUT)/benchmark
 # hash grid on larger ones, for 9.1 minutes of eight cores.
 
 PAPER := $(OUT)/paper-street
-$(PAPER)/street-empty.toml: samples/scenes/street-empty.toml
+$(PAPER)/street-empty.toml: streetgen/scenes/street-empty.toml
 	mkdir -p $(@D) && sed 's/^views.*/views = 720/' $< >$@
 $(PAPER)/train-%/transforms_train.json: $(PAPER)/street-empty.toml
 	$(STREETGEN) build $< --split train --size $* --spp 9 --out $(@D)

@@ -1,22 +1,22 @@
-"""Run a build: estimate its cost, render missing shots in worker processes or on Ray, and say how
-it goes.
+"""Run a build: estimate its cost, render the missing shots in worker processes, show progress.
 
 The estimate was measured on a busy 2-core x86-64 machine (AVX-512, 2.5 GHz) with Mitsuba 3.9.1 and
-LLVM 19, and with CUDA on an H100, which leaves the processor the pixels alone; on other machines
-the progress bar's remaining time is the better figure.
+LLVM 19, and with CUDA on an H100, where only the work for each pixel is left to the processor. On
+other machines the progress bar's remaining time is the better figure.
 """
 
 from __future__ import annotations
 
 import os
+import shlex
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -27,7 +27,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.arguments import time_text
-from rfedge.jobs import Job, Tell, run_jobs
 from rfedge.results import as_json, provenance
 from streetgen.build.listing import claim_folder, list_dataset, origin_of
 from streetgen.build.scene_renderer import RenderJob, SceneRenderer, ShotFiles
@@ -78,34 +77,6 @@ def _take_apart(job: RenderJob, shots: Sequence[Shot], workers: int) -> Iterator
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-SHOTS_A_JOB = 24
-"""On Ray: each job makes the world anew, which takes as long as some shots."""
-JOB_BYTES = 2_500_000_000
-
-
-def _take_on_ray(job: RenderJob, shots: Sequence[Shot], address: str, tell: Tell) -> None:
-    """Take the shots as jobs of a Ray whose machines see the same folder.
-
-    Raises ``RfedgeError`` naming the jobs that failed; the shots that were taken stay valid.
-    """
-    job = replace(job, folder=job.folder.resolve())  # workers run in folders of their own
-    groups = [tuple(shots[i : i + SHOTS_A_JOB]) for i in range(0, len(shots), SHOTS_A_JOB)]
-    run_jobs([_job_of(job, group) for group in groups], tell, address)
-
-
-def _job_of(job: RenderJob, shots: tuple[Shot, ...]) -> Job:
-    first, last = shots[0], shots[-1]
-    name = f"{first.split}-{first.name}-to-{last.split}-{last.name}"
-    work = partial(_take_group, job, shots)
-    return Job(name, work, (), None, cores=job.threads, memory_bytes=JOB_BYTES)
-
-
-def _take_group(job: RenderJob, shots: Sequence[Shot], tell: Tell) -> None:
-    missing = [shot for shot in shots if not ShotFiles.of(job.folder, shot).done]
-    for count, shot in enumerate(_take_here(job, missing), start=1):
-        tell(f"{count} of {len(missing)}: {shot.split}/{shot.name}")
-
-
 def _open_renderer(job: RenderJob) -> None:
     global _renderer
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -119,7 +90,7 @@ def _take(shot: Shot) -> None:
 
 
 def _end_with_parent() -> None:
-    """A pool's workers would wait for ever for a parent that was killed."""
+    """End this worker when its parent is killed; it would wait for work for ever otherwise."""
     parent = parent_process()
     assert parent is not None
     wait([parent.sentinel])
@@ -135,19 +106,19 @@ def _stopped(shot: Shot, error: Exception) -> RfedgeError:
 
 
 START_S = 12.0
-"""Making the world and compiling kernels, in each worker."""
+"""Time that each worker needs to make the world and compile kernels."""
 SAMPLE_US = 2.0
 PIXEL_US = 4.0
-"""Guides, depth, denoising, writing."""
+"""Time for a pixel's guides and depth, and for denoising and writing it."""
 SCALAR_TIMES = 3.5
 PIXEL_BYTES = 3.2
-"""Picture, depth, classes and points together."""
+"""Size on the disk of a pixel's colour, depth and class, with its share of the points."""
 
 
 def cost_line(
     shots: Sequence[Shot], sampling: Sampling, backend: Backend, cores: int, workers: int
 ) -> str:
-    """Return one line: how many frames, core time, time on so many cores, room on the disk."""
+    """Return a line with the number of frames, the time on one core and on all, and the size."""
     pixels = sum(s.camera.intrinsics.width_px * s.camera.intrinsics.height_px for s in shots)
     pixel_us = PIXEL_US if backend == CUDA else sampling.samples * SAMPLE_US + PIXEL_US
     core_s = 1e-6 * pixels * pixel_us * (1.0 if backend.vectorised else SCALAR_TIMES)
@@ -163,7 +134,7 @@ def cost_line(
 def show_progress(
     done: Iterable[object], total: int, console: Console, now_s: Callable[[], float]
 ) -> None:
-    """Exhaust ``done``, of which ``total`` things will come, and show how it goes."""
+    """Consume ``done``, an iterator over ``total`` finished shots, and show the progress."""
     if console.is_terminal:
         _bar(done, total, console)
     else:
@@ -191,13 +162,11 @@ def _lines(
 
 @dataclass(frozen=True)
 class Settings:
-    """How a scene is built, not what."""
+    """Where a scene's pictures go, and what renders them how finely."""
 
     out: Path
     samples: int = 16
     workers: int = 1
-    ray: str | None = None
-    """Address of the Ray that renders (``rfedge.jobs``); None: worker processes do."""
     renderer: Variant = "auto"
 
     def __post_init__(self) -> None:
@@ -206,7 +175,7 @@ class Settings:
 
 
 def build_scene(selection: Selection, settings: Settings, console: Console) -> None:
-    """Take the shots that are not there yet, then list all that are."""
+    """Take the shots that are missing in the folder, then list all finished ones as a dataset."""
     sampling = Sampling(settings.samples, selection.scene.geometry.seed)
     backend = chosen_backend(settings.renderer)
     if not backend.vectorised and settings.renderer == "auto":
@@ -227,21 +196,12 @@ def build_scene(selection: Selection, settings: Settings, console: Console) -> N
         console.print(f"{len(shots) - len(missing)} of {len(shots)} frames are there already")
     if missing:
         console.print(cost_line(missing, sampling, backend, cores, settings.workers))
-        _take_missing(job, missing, settings, console)
+        taken = take_all(job, missing, min(settings.workers, len(missing)))
+        show_progress(taken, len(missing), console, time.monotonic)
     counts = list_dataset(job, _about(job))
     console.print(f"{settings.out}: " + ", ".join(f"{n} {split}" for split, n in counts.items()))
 
 
-def _take_missing(
-    job: RenderJob, missing: Sequence[Shot], settings: Settings, console: Console
-) -> None:
-    if settings.ray is not None:
-        tell = partial(console.print, markup=False, highlight=False)
-        _take_on_ray(job, missing, settings.ray, tell)
-        return
-    taken = take_all(job, missing, min(settings.workers, len(missing)))
-    show_progress(taken, len(missing), console, time.monotonic)
-
-
 def _about(job: RenderJob) -> dict[str, Any]:
-    return {**as_json(provenance()), "build": origin_of(job)}
+    command = shlex.join(["streetgen", *sys.argv[1:]])
+    return {**as_json(provenance(command=command)), "build": origin_of(job)}

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,6 @@ from rfcore.camera import Camera
 from rfcore.dataset.source import SourcePoints
 from rfcore.dataset.write import write_points
 from rfcore.errors import DatasetError
-from rfcore.extras import needs
 from rfcore.files import write_whole
 from rfcore.image import Rgb, write_png
 from rfcore.lens import LensCamera
@@ -29,9 +29,6 @@ from streetgen.render.backend import Backend
 from streetgen.render.renderer import Renderer, Sampling
 from streetgen.scene_file import Scene
 from streetgen.shots import Shot, Split
-
-with needs("scene"):
-    import cv2
 
 __all__ = [
     "POINTS_PER_VIEW",

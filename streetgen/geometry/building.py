@@ -7,18 +7,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
-from rfcore.extras import needs
 from streetgen.geometry.facade import BuildingStyle, facade, rooms
 from streetgen.geometry.grain import enlarged, fractal, texture, tinted
 from streetgen.geometry.layout import BEYOND_M, Layout, Plot
 from streetgen.geometry.mesh import F32, F64, Colour, Label, Material, Mesh, Texture, placed
 from streetgen.geometry.solids import Stuff, boxes, quads
 from streetgen.geometry.world import Part
-
-with needs("scene"):
-    import cv2
 
 __all__ = ["WALL_TILE_M", "bricks", "buildings", "plaster", "roof_tiles", "stone"]
 

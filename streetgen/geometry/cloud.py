@@ -11,13 +11,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from rfcore.extras import needs
 from streetgen.geometry.mesh import F32, F64
-
-with needs("scene"):
-    import cv2
 
 __all__ = [
     "CloudLight",

@@ -6,13 +6,10 @@ that takes a third of the time of filtering white noise by FFT.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from rfcore.extras import needs
 from streetgen.geometry.mesh import F32, Colour, Texture
-
-with needs("scene"):
-    import cv2
 
 __all__ = ["enlarged", "fractal", "speckle", "texture", "tinted"]
 

@@ -5,9 +5,9 @@ Asphalt has cracks and patches, pavements are slabs, and paint is worn.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from rfcore.extras import needs
 from streetgen.geometry.grain import fractal, speckle, texture, tinted
 from streetgen.geometry.layout import (
     BAY_LENGTH_M,
@@ -21,9 +21,6 @@ from streetgen.geometry.layout import (
 from streetgen.geometry.mesh import F32, F64, Label, Material, Mesh, Texture
 from streetgen.geometry.solids import Stuff, boxes, disc, quads
 from streetgen.geometry.world import Part
-
-with needs("scene"):
-    import cv2
 
 __all__ = ["ASPHALT_TILE_M", "SLAB_TILE_M", "asphalt", "paint", "road", "slabs"]
 

@@ -8,13 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
-from rfcore.extras import needs
 from streetgen.geometry.mesh import F32, Material, Texture
-
-with needs("scene"):
-    import cv2
 
 __all__ = [
     "FACES",

@@ -14,9 +14,9 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from rfcore.errors import InvalidInput
-from rfcore.extras import needs
 from streetgen.geometry.mesh import F64
 
 __all__ = ["BODIES", "BodyShape", "Knots", "curve"]
@@ -75,9 +75,6 @@ def _spline(knots: Knots) -> Callable[[F64], F64]:
 
     ``PchipInterpolator`` itself ends with three-point slopes, which would bend noses and tails.
     """
-    with needs("scene"):
-        from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
-
     x, y = np.array(knots, np.float64).T
     slopes = PchipInterpolator(x, y).derivative()(x)
     segments = np.diff(y) / np.diff(x)

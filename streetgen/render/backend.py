@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rfcore.errors import BackendUnavailable
-from rfcore.extras import needs, require
 
-__all__ = ["CUDA", "Backend", "Variant", "chosen_backend", "load_mitsuba", "require_renderer"]
+__all__ = ["CUDA", "Backend", "Variant", "chosen_backend", "load_mitsuba"]
 
 Variant = Literal["auto", "cuda", "llvm", "scalar"]
 """What renders; auto: the first of the others that works."""
@@ -62,17 +61,11 @@ class Backend:
         return self.variant != "scalar_rgb"
 
 
-def require_renderer() -> None:
-    """Raise ``BackendUnavailable`` where the extra is not installed."""
-    require("scene", "mitsuba", "pyoidn", "scipy")
-
-
 def chosen_backend(variant: Variant = "auto") -> Backend:
     """Return the first backend that renders of those that the variant permits.
 
     Raises ``BackendUnavailable`` where the variant named does not work here.
     """
-    require_renderer()
     for backend in _candidates(variant):
         if _renders(backend):
             return backend
@@ -137,12 +130,9 @@ def load_mitsuba(backend: Backend, threads: int) -> Any:
     """Import Mitsuba in this process, which can have one backend only; return the module."""
     if backend.llvm:
         os.environ["DRJIT_LIBLLVM_PATH"] = backend.llvm
-    with needs("scene"):
-        mitsuba = import_module("mitsuba")
+    mitsuba = import_module("mitsuba")
     mitsuba.set_variant(backend.variant)
     if backend.vectorised:
-        with needs("scene"):
-            drjit = import_module("drjit")
-        drjit.set_thread_count(threads)
+        import_module("drjit").set_thread_count(threads)
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     return mitsuba

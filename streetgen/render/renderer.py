@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyoidn
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics
 from rfcore.errors import InvalidInput
-from rfcore.extras import needs
 from streetgen.geometry.mesh import F32, F64, Label
 from streetgen.geometry.world import World
 from streetgen.render.backend import Backend, load_mitsuba
@@ -50,8 +50,7 @@ def _directions(k: Intrinsics) -> tuple[F64, F64]:
 def _cast_together(
     mi: Any, loaded: MitsubaScene, origin: F64, towards: F64
 ) -> tuple[F64, NDArray[np.intp]]:
-    with needs("scene"):
-        import drjit
+    import drjit
 
     rays = mi.Ray3f(
         mi.Point3f(*(mi.Float(np.full(len(towards), value, np.float32)) for value in origin)),
@@ -190,8 +189,5 @@ def _fov_deg(k: Intrinsics) -> float:
 
 
 def _denoised(colour: F32, albedo: F32, normal: F32) -> F32:
-    with needs("scene"):
-        import pyoidn
-
     guides = (np.ascontiguousarray(values) for values in (albedo, normal))
     return np.asarray(pyoidn.denoise(np.ascontiguousarray(colour), *guides, hdr=True), np.float32)

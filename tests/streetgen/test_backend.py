@@ -91,12 +91,3 @@ def test_an_llvm_that_is_asked_for_and_not_there_is_an_error(
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     with pytest.raises(BackendUnavailable, match="DRJIT_LIBLLVM_PATH names it"):
         backend.chosen_backend("llvm")
-
-
-@pytest.mark.parametrize("missing", ["mitsuba", "pyoidn", "scipy"])
-def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
-    monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(
-        BackendUnavailable, match=rf"^{missing} is missing: pip install 'rfedge\[scene\]'$"
-    ):
-        backend.require_renderer()

@@ -3,11 +3,9 @@
 import errno
 import io
 import json
-import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,9 +18,7 @@ from rfcore.dataset import read_dataset, verify_manifest
 from rfcore.dataset.rig import read_rig, read_rig_drive
 from rfcore.dataset.source import read_points
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.jobs import Job, Tell, run_jobs
 from streetgen.build import run
-from streetgen.build import run as workers
 from streetgen.build.run import Settings, build_scene
 from streetgen.build.scene_renderer import (
     RenderJob,
@@ -65,7 +61,7 @@ class QuickRenderer(SceneRenderer):
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "SceneRenderer", QuickRenderer)
+    monkeypatch.setattr(run, "SceneRenderer", QuickRenderer)
     monkeypatch.setattr(run, "chosen_backend", lambda _: Backend("llvm_ad_rgb", "libLLVM.so"))
 
 
@@ -239,56 +235,6 @@ def test_the_scalar_variant_is_said_in_one_line(
     monkeypatch.setattr(run, "chosen_backend", lambda _: Backend("scalar_rgb"))
     first = build(tmp_path / "s", splits="drive", frames="0:1").splitlines()[0]
     assert first == "no LLVM that Mitsuba can use (19 is known to work): scalar_rgb, 3-4x slower"
-
-
-def build_on_ray(out: Path) -> str:
-    said = io.StringIO()
-    selection = Selection(SCENE, "all", "0:9", SIZE_PX)
-    build_scene(selection, Settings(out, ray="10.0.0.1:6379"), Console(file=said, width=200))
-    return said.getvalue()
-
-
-def test_a_build_of_jobs_is_the_build_of_workers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    addresses: list[str | None] = []
-
-    def run_here(jobs: Sequence[Job], tell: Tell, address: str | None) -> int:
-        """Do what Ray's workers would do, here."""
-        addresses.append(address)
-        assert [job.cores for job in jobs] == [len(os.sched_getaffinity(0))] * 3
-        return run_jobs(jobs, tell)
-
-    monkeypatch.setattr(workers, "run_jobs", run_here)
-    monkeypatch.setattr(workers, "SHOTS_A_JOB", 4)
-    build(tmp_path / "workers", frames="0:9")
-    said = build_on_ray(tmp_path / "jobs")
-    assert addresses == ["10.0.0.1:6379"]
-    assert "drive-000000-to-drive-000003: done" in said
-    made = files(tmp_path / "jobs")
-    assert made == files(tmp_path / "workers")
-    build_on_ray(tmp_path / "jobs")
-    assert len(addresses) == 1, "all frames were there"
-
-
-def test_a_job_that_fails_is_named_and_the_others_frames_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class FullDisk(QuickRenderer):
-        def take(self, shot: Shot) -> None:
-            if shot.name == "000005":
-                raise OSError(28, "No space left on device")
-            super().take(shot)
-
-    monkeypatch.setattr(workers, "run_jobs", lambda jobs, tell, _: run_jobs(jobs, tell))
-    monkeypatch.setattr(workers, "SHOTS_A_JOB", 4)
-    monkeypatch.setattr(workers, "SceneRenderer", FullDisk)
-    with pytest.raises(RfedgeError, match=r"1 of 3 jobs failed.*\n.*000005 could not be written"):
-        build_on_ray(tmp_path / "s")
-    monkeypatch.setattr(workers, "SceneRenderer", QuickRenderer)
-    assert "6 of 9 frames are there already" in build_on_ray(tmp_path / "s")
-    build(tmp_path / "whole", frames="0:9")
-    assert files(tmp_path / "s") == files(tmp_path / "whole")
 
 
 def test_workers_are_counted(tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
 """Effects do what their law says, and one that is not declared does not exist for a scene."""
 
 import math
-import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +24,7 @@ from streetgen.effects.noise import SensorNoise
 from streetgen.effects.rain import Rain
 from streetgen.effects.rolling_shutter import RollingShutter
 from streetgen.frame import LinearFrame, display_rgb, sampled
-from streetgen.plan import plain_frame, planned_effects
+from streetgen.plan import plain_frame
 from streetgen.scene_file import Scene
 
 ROOT = Path(__file__).parents[2]
@@ -188,60 +186,11 @@ def test_effects_run_one_after_the_other(frame: LinearFrame) -> None:
     np.testing.assert_array_equal(both, expected)
 
 
-def test_a_plan_measures_what_is_declared() -> None:
-    clock = iter(np.arange(1000) * 0.25)
-    planned = planned_effects(scene(noise=SensorNoise(), haze=Haze()), lambda: float(next(clock)))
-    assert [(effect.name, effect.cost_ms) for effect in planned] == [("haze", 250), ("noise", 250)]
-
-
 def test_the_display_curve_is_srgb(frame: LinearFrame) -> None:
     """IEC 61966-2-1: linear 0.2159 is code 128."""
     for linear, code in ((0.0, 0), (0.002, 7), (0.2159, 128), (1.0, 255), (3.0, 255)):
         grey = replace(frame, colour=np.full((2, 2, 3), linear, np.float32))
         assert (display_rgb(grey) == code).all()
-
-
-PROGRAM = """
-import hashlib, sys
-sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswith("_editable")]
-import rfedge
-from streetgen import load_scene
-from streetgen.assembly import apply_effects
-from streetgen.plan import plain_frame
-scene = load_scene(sys.argv[1])
-frame = apply_effects(scene, plain_frame(64, 36, 90.0), 0)
-loaded = [name for name in sys.modules if name.startswith("streetgen.effects.")]
-digest = hashlib.sha256(frame.colour.tobytes()).hexdigest()
-print(rfedge.__file__, digest, *sorted(loaded))
-"""
-
-
-def run(root: Path, scene_file: Path) -> list[str]:
-    """Run without an editable install's finder, which would lead every root to the checkout."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(scene_file)],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=root,
-        env={"PYTHONPATH": str(root), "PATH": ""},
-    )
-    used, *seen = done.stdout.split()
-    assert Path(used).is_relative_to(root)
-    return seen
-
-
-def test_an_undeclared_effect_is_neither_imported_nor_needed(tmp_path: Path) -> None:
-    """The frame has the same bytes when the files of all other effects are deleted."""
-    scene_file = tmp_path / "s.toml"
-    scene_file.write_text('name = "x"\nfield = "x"\n[effects.haze]\n[effects.noise]\n')
-    digest, *loaded = run(ROOT, scene_file)
-    assert loaded == ["streetgen.effects.haze", "streetgen.effects.noise"]
-    for package in ("rfedge", "rfcore"):
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("csrc"))
-    for name in set(NAMES) - {"haze", "noise"}:
-        (tmp_path / "rfedge" / "street" / "effects" / f"{name}.py").unlink()
-    assert run(tmp_path, scene_file) == [digest, *loaded]
 
 
 def test_an_undeclared_effect_costs_nothing(frame: LinearFrame) -> None:

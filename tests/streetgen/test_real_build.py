@@ -1,8 +1,6 @@
 """The street itself, rendered: two workers, a static pose, a real kill."""
 
 import io
-import os
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,11 +13,9 @@ from rich.console import Console
 from rfcore.dataset import read_dataset, verify_manifest
 from rfcore.image import read_rgb
 from rfcore.metrics import psnr
-from rfcore.native import _native
 from streetgen import load_scene
 from streetgen.build.run import Settings, build_scene
 from streetgen.build.scene_renderer import RenderJob, SceneRenderer
-from streetgen.effects import EFFECTS
 from streetgen.render.backend import chosen_backend
 from streetgen.render.renderer import Sampling
 from streetgen.scene_file import Scene
@@ -79,30 +75,11 @@ def test_two_workers_take_the_same_pictures_as_one(standing: Scene, tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
-def test_jobs_on_ray_take_the_same_pictures_as_one_worker(
-    standing: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)  # a relative folder: workers of Ray run elsewhere
-    selection = Selection(standing, "drive", "0:2", (64, 36))
-    for settings in (Settings(Path("one")), Settings(Path("jobs"), ray="local")):
-        build_scene(selection, settings, Console(file=io.StringIO()))
-    one, jobs = (
-        [picture.read() for picture in read_dataset(Path(name)).pictures]
-        for name in ("one", "jobs")
-    )
-    assert len(one) == 2
-    for a, b in zip(one, jobs, strict=True):
-        np.testing.assert_array_equal(a, b)
-    verify_manifest(tmp_path / "jobs")
-
-
-@pytest.mark.slow
 def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     file = tmp_path / "driving.toml"
     file.write_text(SHORT.format(speed_mps=5.0))
-    command = [sys.executable, "-c", "from rfedge.cli import main; main()", "scene", "build"]
-    command += [str(file), "--out", str(tmp_path / "s"), "--size", "64x36"]
+    command = [sys.executable, "-m", "streetgen", "build", str(file)]
+    command += ["--out", str(tmp_path / "s"), "--size", "64x36"]
     command += ["--split", "drive", "--workers", "2"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
@@ -114,50 +91,3 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     scene = load_scene(str(file))
     build(scene, tmp_path / "s", (64, 36), 1, "0:4")
     assert len(read_dataset(tmp_path / "s").pictures) == 4
-
-
-PROGRAM = """
-import sys
-from pathlib import Path
-sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswith("_editable")]
-import rfedge
-from streetgen import load_scene
-from streetgen.build.scene_renderer import RenderJob, SceneRenderer
-from streetgen.render.backend import chosen_backend
-from streetgen.render.renderer import Sampling
-from streetgen.shots import Split, shots_of
-scene, out = load_scene(sys.argv[1]), Path(sys.argv[2])
-renderer = SceneRenderer(RenderJob(scene, out, Sampling(4), chosen_backend(), 1))
-renderer.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
-loaded = [name for name in sys.modules if name.startswith("streetgen.effects.")]
-picture = (out / "drive" / "images" / "000000.png").read_bytes()
-print(Path(rfedge.__file__).parents[1], picture.hex(), *sorted(loaded))
-"""
-
-
-@pytest.mark.slow
-def test_pictures_are_the_same_without_the_files_of_other_effects(tmp_path: Path) -> None:
-    """Nor are those effects imported while a frame is made, from the world to the file.
-
-    An editable install would lead both programs to the checkout: they do without its finder.
-    """
-    file = tmp_path / "hazy.toml"
-    file.write_text(SHORT.format(speed_mps=5.0) + "[effects.haze]\n")
-    for root in (tmp_path / "whole", tmp_path / "bare"):
-        for package in ("rfedge", "rfcore"):
-            shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("csrc"))
-        shutil.copy(str(_native.__file__), root / "rfcore" / "native")
-    for effect in EFFECTS:
-        if effect.name != "haze":
-            (tmp_path / "bare" / "streetgen/effects" / f"{effect.name}.py").unlink()
-    seen = []
-    for root in (tmp_path / "whole", tmp_path / "bare"):
-        command = [sys.executable, "-c", PROGRAM, str(file), str(root / "s")]
-        environment = {**os.environ, "PYTHONPATH": str(root)}
-        done = subprocess.run(command, capture_output=True, text=True, cwd=root, env=environment)
-        assert done.returncode == 0, done.stderr
-        used, *made = done.stdout.split()
-        assert Path(used) == root
-        seen.append(made)
-    assert seen[0] == seen[1]
-    assert seen[0][1:] == ["streetgen.effects.haze"]

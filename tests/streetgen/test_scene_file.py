@@ -12,7 +12,7 @@ from streetgen import load_scene
 from streetgen.trajectory import drive_pose
 
 ROOT = Path(__file__).parents[2]
-READY_MADE = sorted((ROOT / "samples" / "scenes").glob("*.toml"))
+READY_MADE = sorted((ROOT / "streetgen" / "scenes").glob("*.toml"))
 START = 'name = "x"\nfield = "y"\n'
 
 
@@ -22,7 +22,7 @@ def test_a_ready_made_scene_is_a_scene(path: Path, monkeypatch: pytest.MonkeyPat
     scene = load_scene(path.stem)
     assert scene.name == path.stem
     assert scene == load_scene(str(path))
-    assert (ROOT / "samples" / "scenes" / f"{scene.field}.toml").is_file()
+    assert (ROOT / "streetgen" / "scenes" / f"{scene.field}.toml").is_file()
 
 
 def test_the_published_evaluation_is_144_frames(monkeypatch: pytest.MonkeyPatch) -> None:

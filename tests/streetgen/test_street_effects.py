@@ -415,7 +415,7 @@ BUILD = """
 import hashlib, sys
 from pathlib import Path
 sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswith("_editable")]
-import rfedge
+import streetgen
 from streetgen import load_scene
 from streetgen.build.scene_renderer import RenderJob, SceneRenderer
 from streetgen.render.backend import chosen_backend
@@ -427,7 +427,7 @@ renderer.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
 files = sorted(path for path in Path(sys.argv[2]).rglob("*") if path.is_file())
 print(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files))
 print(*sorted(n for n in sys.modules if n.startswith("streetgen.effects.")))
-print(Path(rfedge.__file__).parents[1])
+print(Path(streetgen.__file__).parents[1])
 """
 SMALL = 'name = "x"\nfield = "x"\n[geometry]\nlength_m = 40\ntrees = false\n'
 PEOPLE = {"pedestrians": "person", "cyclists": "cyclist"}
@@ -454,10 +454,10 @@ def test_a_build_neither_imports_nor_needs_what_is_not_declared(
     )
     text = SMALL + "".join(f"[effects.{name}]\n" for name in declared)
     (tmp_path / "s.toml").write_text(text)
-    for package in ("rfedge", "rfcore"):
+    for package in ("streetgen", "rfedge", "rfcore"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("csrc"))
     shutil.copy(str(_native.__file__), tmp_path / "rfcore" / "native")
-    street = tmp_path / "rfedge" / "street"
+    street = tmp_path / "streetgen"
     whole = built(tmp_path, tmp_path / "s.toml", tmp_path / "whole")
     for effect in EFFECTS:
         if effect.name not in declared:
