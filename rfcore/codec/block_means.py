@@ -49,9 +49,9 @@ def block_mean_difference(a: bytes, b: bytes) -> int:
 
 
 def median_block_mean_difference(a: I420, b: I420) -> float:
-    """Return the median of the block means' differences, in levels: how far two lights are apart.
+    """Return the median of the block means' differences, in levels: how much two lights differ.
 
-    What stands in less than half of the blocks, as vehicles do, does not count.
+    An object that covers less than half of the blocks, as a vehicle does, does not change it.
     """
     means = (np.frombuffer(block_mean_digest(p), np.uint8).astype(np.int16) for p in (a, b))
     return float(np.median(np.abs(np.subtract(*means))))

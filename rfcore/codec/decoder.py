@@ -7,8 +7,8 @@ of the payload, and at last the digests of its render and of the decoded picture
 take little longer than one alone. Where decoding fails, a render that is not the sender's is named
 first: it is the likely cause.
 
-With inexact renderers an error would pass on from frame to frame, so then only the render may be
-predicted from.
+With inexact renderers an error would spread from frame to frame, so then frames may be predicted
+from the render only.
 """
 
 from __future__ import annotations
@@ -31,22 +31,16 @@ from rfcore.views import FieldView
 
 __all__ = ["Decoded", "DeltaDecoder", "prediction_of"]
 
-Clock = Callable[[], int]
-
 _MEANS_REQUIRED = "between renderers that are not exact the sender must send them"
-
-
-def _stopped_clock() -> int:
-    return 0
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """A frame and the receiver's next state; ``lost`` packets are missing right before it.
+    """A decoded frame and the receiver's next state; ``lost`` packets are missing right before it.
 
-    ``exact``: the frame is the sender's to the bit; otherwise the render differed by rounding.
-    ``stage_ns`` has "references" (checks, making what is not the render), "splice" (the references
-    as pictures of the decoder) and "decode" (the slice, the digests of render and picture).
+    ``exact``: the frame equals the sender's to the bit; otherwise the render differed by rounding.
+    ``stage_ns`` has the times of "references" (checks, warp, correction), "splice" (feeding the
+    references to the decoder) and "decode" (the slice, the digests of render and picture).
     """
 
     frame: I420
@@ -61,16 +55,16 @@ class DeltaDecoder:
 
     With ``exact=False`` the sender's renderer may differ by rounding: a render of another digest
     but of the same block means, up to rounding, is accepted, and its reconstruction cannot be
-    checked. Between exact renderers no packet needs block means; where they are there, they say
-    what kind of difference led to ``RENDER_MISMATCH``. ``open_decoder`` makes the standard decoder
-    that sees the sender's bytes.
+    checked. Between exact renderers no packet needs block means; if they are present, they say what
+    kind of difference led to ``RENDER_MISMATCH``. ``open_decoder`` opens the standard decoder that
+    reads the sender's bytes.
     """
 
     def __init__(
         self,
         header: StreamHeader,
         exact: bool = True,
-        clock_ns: Clock = _stopped_clock,
+        clock_ns: Callable[[], int] = lambda: 0,
         open_decoder: Callable[[tuple[int, int]], PictureDecoder] = H264Decoder,
     ) -> None:
         self._config = header.config
@@ -128,7 +122,7 @@ class DeltaDecoder:
     def _checked(
         self, packet: DeltaPacket, render: I420, prediction: Prediction, frame: I420
     ) -> tuple[Past, bool]:
-        """Return what was decoded, and whether it is known to be the sender's to the bit.
+        """Return the decoded frame, and whether it is known to equal the sender's to the bit.
 
         Raises ``PacketRejected`` for a render or picture that is not the sender's.
         """
@@ -146,7 +140,8 @@ class DeltaDecoder:
         return prediction.past_of(frame, digest), same_render
 
     def _check_render(self, packet: DeltaPacket, render: I420, digest: bytes) -> bool:
-        """Tell whether the renders are identical; raise if they may not be used together."""
+        """Return whether the renders are identical; raise if the packet cannot be decoded with
+        ours."""
         if digest == packet.render_digest:
             return True
         if not packet.render_block_means:
@@ -171,7 +166,7 @@ class DeltaDecoder:
         )
 
     def _past(self, state: DecoderState, packet: DeltaPacket) -> Past | None:
-        """Return the earlier frame the packet predicts from, if it does."""
+        """Return the earlier frame that the packet predicts from, if there is one."""
         if not packet.needs_base:
             return None
         if not self._exact:
@@ -198,7 +193,7 @@ class DeltaDecoder:
             raise PacketRejected(RejectReason.MALFORMED_PAYLOAD, str(error)) from error
 
     def _reconstruct(self, packet: DeltaPacket, pictures: tuple[I420, ...]) -> tuple[int, I420]:
-        """Return the time at which the decoder held the references, and the decoded frame."""
+        """Return the time when the decoder had the references, and the decoded frame."""
         if not packet.payload:
             return self._clock_ns(), without_zeros(pictures[0])
         try:
@@ -210,7 +205,7 @@ class DeltaDecoder:
 
 
 def prediction_of(packet: DeltaPacket, view: FieldView, past: Past | None) -> Prediction:
-    """Return what ``packet`` was predicted from; raise ``PacketRejected`` if that cannot be."""
+    """Return what ``packet`` was predicted from; raise ``PacketRejected`` if it cannot be made."""
     if not packet.relit:
         return Prediction.under_light(view, packet.photometric, past)
     try:

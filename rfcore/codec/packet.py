@@ -1,4 +1,4 @@
-"""The delta packet: one slice with everything a receiver needs to verify or refuse it."""
+"""The delta packet: one slice with everything a receiver needs to verify it or refuse it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ __all__ = ["BASE_DIGEST_BYTES", "DIGEST_BYTES", "CheckedPacket", "DeltaPacket", 
 DIGEST_BYTES = 16
 
 BASE_DIGEST_BYTES = 4
-"""Enough to tell a few kept frames apart. Should two begin alike, the check of the reconstruction's
-digest fails; no wrong picture is shown."""
+"""Four bytes tell a few kept frames apart. If two digests begin alike, the check of the
+reconstruction's digest fails; no wrong picture is shown."""
 
 _UINT32, _UINT64 = 1 << 32, 1 << 64
 _DIGEST, _BLOCK_MEANS, _NOTHING = (DIGEST_BYTES,), (0, BLOCK_MEANS_BYTES), (0,)
@@ -29,16 +29,17 @@ class DeltaPacket:
     """One coded frame. Raises ``InvalidInput`` for digests of a wrong length and for numbers
     outside uint64 (``epoch``, ``sequence``) or uint32 (``crc32``); nothing else is checked here.
 
-    ``payload`` is one NAL unit without start code; empty, the frame is its only reference as it is.
-    ``render_digest`` and ``render_block_means`` are of the sender's render at the frame's pose,
-    whatever the frame is predicted from: they tell whether both ends have the same pose and field.
+    ``payload`` is one NAL unit without start code; if it is empty, the frame equals its only
+    reference. ``render_digest`` and ``render_block_means`` describe the sender's render at the
+    frame's pose, whatever the frame is predicted from, so that the receiver can tell whether both
+    ends have the same pose and field.
     ``render_block_means`` is empty between exact renderers, where no difference is tolerated.
     ``reconstruction_digest`` is of the picture the receiver must get (``I420.digest``).
-    ``base_digest`` names the earlier frame that ``references`` call for by the first bytes of its
-    reconstruction digest (4 as we write it, up to all 16), and is empty when they call for none;
-    ``photometric`` changes the render before it is used. A frame that is ``relit`` has its render
-    mapped to ``light`` (``rfcore.codec.photometric``) or, where that is empty, to the light of the
-    frame ``base_digest`` names (``rfcore.native.warp.relight_i420``).
+    ``base_digest`` names the earlier frame that ``references`` need by the first bytes of its
+    reconstruction digest (we write 4, up to 16 are read); it is empty when they need none.
+    ``photometric`` changes the render before it is used. If ``relit``, the render is mapped to
+    ``light`` (``rfcore.codec.photometric``) or, where that is empty, to the light of the frame that
+    ``base_digest`` names (``rfcore.native.warp.relight_i420``).
     ``crc32`` covers all other fields (``expected_crc32``): a damaged sequence number would
     otherwise make every later packet look stale.
     """
@@ -77,18 +78,21 @@ class DeltaPacket:
 
     @property
     def needs_base(self) -> bool:
-        """Whether an earlier frame is needed, which ``base_digest`` names."""
+        """True if an earlier frame is needed, which ``base_digest`` names."""
         return self.learns_light or is_temporal(self.references)
 
     @property
     def learns_light(self) -> bool:
-        """Whether the render's light is learnt from that earlier frame."""
+        """True if the render's light is learnt from that earlier frame."""
         return self.relit and not self.light
 
     def expected_crc32(self) -> int:
-        """Return zlib.crc32 of epoch and sequence (8 bytes each, big-endian), the digests in the
-        order of the fields, the payload, a byte for each reference, the base digest, the
-        photometric numbers (2 bytes each), and if the frame is relit a byte 1 and the light."""
+        """Return zlib.crc32 of the packet's other fields.
+
+        They are epoch and sequence (8 bytes each, big-endian), the digests in the order of the
+        fields, the payload, a byte for each reference, the base digest, the photometric numbers (2
+        bytes each), and if the frame is relit a byte 1 and the light.
+        """
         head = (
             self.epoch.to_bytes(8, "big"),
             self.sequence.to_bytes(8, "big"),
@@ -113,10 +117,10 @@ class DeltaPacket:
 
 @dataclass(frozen=True)
 class CheckedPacket:
-    """A packet that arrived intact and in order: what ``check_packet`` returns.
+    """A packet that arrived intact and in order, as ``check_packet`` returns it.
 
-    Decoders take packets in this form alone, so each is checked once, before anything is rendered
-    for it. ``lost``: how many packets are missing right before it.
+    Decoders take only this type, so every packet is checked once, before anything is rendered for
+    it. ``lost``: how many packets are missing right before it.
     """
 
     packet: DeltaPacket

@@ -1,6 +1,6 @@
-"""The photometric side channel: a render under another light, computed alike by both ends.
+"""Photometric side information: both ends map a render to another light in the same way.
 
-When the scene is lit otherwise than the field was, the sender says how the render's samples change.
+When the scene is lit differently from the field, the sender says how the render's samples change.
 Both ends apply that to the render before it becomes a reference. There are two ways:
 
 * A *matrix* M [3, 4] that maps the render's (Y, U, V, 1) closest to the frame's (Y, U, V), in 12
@@ -12,13 +12,14 @@ Both ends apply that to the render before it becomes a reference. There are two 
 The matrix is applied in integers, so that both ends get the same bytes: coefficients are in 1/4096
 (columns Y, U, V), the last column in levels / 16. Chroma rows see the rounded mean of the 2x2 luma
 samples; luma rows see the chroma sample of their block; a last odd row or column counts twice. Y, U
-and V enter without their offsets (16, 128, 128), sums are rounded half up, and samples clamped to
-1..255.
+and V enter without their offsets (16, 128, 128), sums are rounded half up, and samples are clamped
+to 1..255.
 
 A light is written as a byte, the step S in levels, and a raw deflate stream (RFC 1951) of one byte
 for each plane, bin, row and column of the grid, in this order: by how many steps samples change
-there, int8, less the median of what is to the left, above, and their sum less what is above to the
-left, modulo 256; what is beyond the first row or column is as its neighbour, and in the corner 0.
+there, int8, minus the median of three values (the left neighbour, the upper one, and their sum
+minus the upper left one), modulo 256. Beyond the first row or column the nearest value is repeated;
+the corner's is 0.
 """
 
 from __future__ import annotations
@@ -55,14 +56,15 @@ _SAMPLES = 160 * 90
 
 MOST_LIGHT_BYTES = 1024
 LIGHT_STEPS = (4, 8, 16, 32)
-"""Levels. At dusk with a field of noon a light of the yardstick's first frame takes 509 bytes with
-4 levels, with which the frame takes the fewest bits; with 1 level 791, with 8 levels 385."""
+"""Step sizes in levels. With a field of noon, the light of the benchmark street's first frame at
+dusk takes 509 bytes in steps of 4 levels, with which the frame takes the fewest bits; in steps of 1
+level it takes 791 bytes, in steps of 8 levels 385."""
 _LEVEL = 1 << 8
-"""Of what ``rfcore.native.warp`` counts in."""
+"""One level in the unit of ``rfcore.native.warp``."""
 _RAW_DEFLATE = -zlib.MAX_WBITS
 
 Photometric = tuple[int, ...]
-"""Nothing, or M row by row."""
+"""The matrix M row by row; empty for no change of light."""
 
 I32 = NDArray[np.int32]
 F64 = NDArray[np.floating[Any]]
@@ -79,7 +81,7 @@ def check_photometric(photometric: Photometric) -> Photometric:
 
 
 def adapt(render: I420, photometric: Photometric) -> I420:
-    """Return ``render`` under the light of ``photometric``; itself if that is nothing."""
+    """Return ``render`` under the light of ``photometric``; ``render`` itself if that is empty."""
     if not photometric:
         return render
     m = np.array(photometric, np.int32).reshape(3, 4)
@@ -114,7 +116,7 @@ def solve(frame: I420, render: I420) -> Photometric:
 
 
 def sent_light(frame: I420, render: I420) -> bytes:
-    """Return the light that maps ``render`` to ``frame``, as it is sent; nothing where it would be
+    """Return the light that maps ``render`` to ``frame``, as it is sent; empty if it would be
     longer than ``MOST_LIGHT_BYTES``."""
     changes = solve_light(frame, render)
     for step in LIGHT_STEPS:
@@ -129,8 +131,10 @@ def sent_light(frame: I420, render: I420) -> bytes:
 
 
 def lit_by(render: I420, light: bytes) -> I420:
-    """Return ``render`` under a light that was sent; raise ``InvalidInput`` for one that is none of
-    a picture of that size."""
+    """Return ``render`` under a light that was sent.
+
+    Raises ``InvalidInput`` for bytes that are no light of a picture of that size.
+    """
     rows, columns, bins, planes = shape = light_shape(render.size_px)
     if not 1 < len(light) <= MOST_LIGHT_BYTES:
         raise InvalidInput("light", f"{len(light)} bytes where 2..{MOST_LIGHT_BYTES} are expected")
@@ -149,7 +153,7 @@ def lit_by(render: I420, light: bytes) -> I420:
 
 
 def _residuals(steps: I32) -> I32:
-    """Return steps [..., rows, columns] less what is expected by those before, modulo 256."""
+    """Return steps [..., rows, columns] minus their prediction from earlier ones, modulo 256."""
     expected = np.zeros_like(steps)
     left, above, corner = steps[..., 1:, :-1], steps[..., :-1, 1:], steps[..., :-1, :-1]
     expected[..., 1:, 1:] = _median(left, above, left + above - corner)
@@ -159,7 +163,7 @@ def _residuals(steps: I32) -> I32:
 
 
 def _summed(residuals: NDArray[np.uint8]) -> I32:
-    """Return the steps of residuals [planes, bins, rows, columns], int8 values as int32."""
+    """Return the steps, int8 values as int32, of residuals [planes, bins, rows, columns]."""
     steps = np.zeros(residuals.shape, np.int32)
     _, _, rows, columns = residuals.shape
     for row in range(rows):

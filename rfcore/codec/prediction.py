@@ -1,4 +1,4 @@
-"""The references of a frame as pictures, made alike by both ends.
+"""The reference pictures of a frame, computed identically by both ends.
 
 ``PREVIOUS``, ``WARP`` and ``CORRECTION`` need an earlier frame; ``RENDER`` is always there.
 """
@@ -21,22 +21,23 @@ __all__ = ["Prediction"]
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What both ends hold of a frame before a bit of it is sent.
+    """Everything a frame can be predicted from, which both ends have before anything is sent.
 
-    ``view`` is what the field shows at the frame's pose, its render under the frame's light;
-    ``past`` the earlier frame to predict from. ``threads`` changes no picture.
+    ``view`` is what the field shows at the frame's pose, with its render under the frame's light;
+    ``past`` is the earlier frame to predict from. ``threads`` changes no picture.
     """
 
     view: FieldView
     past: Past | None = None
     threads: int = 1
     photometric: Photometric = ()
-    """How the light of the render of ``view`` was changed by numbers."""
+    """The matrix that changed the light of the render of ``view``; empty for none."""
     is_relit: bool = False
-    """Whether it is under ``light`` or, without one, that learnt from the frame in ``past``."""
+    """True if the render is under ``light`` or, without one, under the light learnt from
+    ``past``."""
     light: bytes = b""
     plain_render: I420 | None = None
-    """The render of the field, where that of ``view`` is under another light."""
+    """The field's own render, if the render of ``view`` is under another light."""
 
     @staticmethod
     def under_light(
@@ -52,11 +53,11 @@ class Prediction:
     def relit(
         view: FieldView, past: Past | None, threads: int = 1, light: bytes = b""
     ) -> Prediction:
-        """Return the prediction with the render of ``view`` under ``light`` or, without one, under
-        that which ``past`` was seen in.
+        """Return the prediction with the render of ``view`` under ``light``; without one, under the
+        light of the frame ``past``.
 
-        Raises ``InvalidInput`` for a light that is none, without either, or for an earlier frame of
-        another size.
+        Raises ``InvalidInput`` for bytes that are no light, for neither a light nor a past, and for
+        a past of another size.
         """
         if light:
             render = lit_by(view.render, light)
@@ -69,35 +70,35 @@ class Prediction:
 
     @property
     def learns_light(self) -> bool:
-        """Whether its light is learnt from the frame in ``past``."""
+        """True if the light is learnt from the frame in ``past``."""
         return self.is_relit and not self.light
 
     def past_of(self, picture: I420, digest: bytes | None = None) -> Past:
-        """Return what later frames predict from once this frame was decoded to ``picture``.
+        """Return the past of later frames once this frame was decoded to ``picture``.
 
-        ``digest``: the picture's, where it is known already.
+        ``digest``: the picture's digest, if it is known already.
         """
         return Past(picture, self.view.without_opacity(), digest, self.plain_render)
 
     @property
     def available(self) -> frozenset[Reference]:
-        """Which references can be made."""
+        """The references that can be computed."""
         return frozenset({Reference.RENDER} if self.past is None else Reference)
 
     @property
     def render(self) -> I420:
-        """The field's picture at the frame's pose, under the frame's light."""
+        """The field's render at the frame's pose, under the frame's light."""
         return self.view.render
 
     @cached_property
     def warp(self) -> I420:
-        """The earlier frame at the present pose, holes filled from the render."""
+        """The earlier frame carried to the present pose, with holes filled from the render."""
         past = self._past()
         return warp_i420(past.picture, past.view, self.view, self.threads)
 
     @cached_property
     def correction(self) -> I420:
-        """The render, with most of what the earlier frame differed by from its own render."""
+        """The render plus most of the earlier frame's difference from its own render."""
         past = self._past()
         return correct_i420(past.picture, past.view, self.view, self.threads)
 
@@ -107,7 +108,8 @@ class Prediction:
         return self.past
 
     def picture(self, reference: Reference) -> I420:
-        """Return one reference; raise ``InvalidInput`` for one that cannot be made."""
+        """Return one reference; raise ``InvalidInput`` if it needs an earlier frame that is
+        missing."""
         match reference:
             case Reference.RENDER:
                 return self.render

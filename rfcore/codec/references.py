@@ -1,4 +1,4 @@
-"""Which pictures a frame is predicted from, and in which order.
+"""The pictures a frame is predicted from, and their order.
 
 Both ends can make all of them: the field's *render* at the frame's pose; the *previous* frame as
 decoded; the *warp*, the previous frame carried to the present pose by the field's depth; and the
@@ -28,7 +28,7 @@ __all__ = [
 
 
 class Reference(IntEnum):
-    """A picture that both ends have. The numbers are those of the wire."""
+    """A kind of reference picture. The numbers are those of the wire."""
 
     RENDER = 1
     PREVIOUS = 2

@@ -1,10 +1,10 @@
-"""What each end remembers between frames: sequence numbers, and frames to predict from.
+"""The state of each end between frames: sequence numbers, and frames to predict from.
 
 A decoded frame is identified by the digest of its picture. A packet that predicts from an earlier
 frame names it (``DeltaPacket.base_digest``, the first bytes of that digest), and its own
 ``reconstruction_digest`` identifies the frame it makes. The sender predicts from one frame at a
-time, and which one is the caller's choice: the last sent, or, after a loss, the last that is known
-to have been decoded. The receiver keeps the last few, so that rolling back needs no new start.
+time, and the caller chooses it: the last one sent or, after a loss, the last one known to have been
+decoded. The receiver keeps the last few, so rolling back needs no restart.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from rfcore.views import FieldView
 __all__ = ["KEPT_FRAMES", "DecoderState", "EncoderState", "Past"]
 
 KEPT_FRAMES = 4
-"""Decoded frames a receiver keeps: two on their way, the one they follow, and one to spare."""
+"""Decoded frames a receiver keeps: two in flight, the one before them, and one spare."""
 
 
 @dataclass(frozen=True, eq=False)
 class Past:
     """A decoded frame that later ones may predict from.
 
-    ``view`` is what the field shows at the frame's pose, its render under the frame's light: with
-    it the frame can be carried to another pose.
+    ``view`` is what the field shows at the frame's pose, with its render under the frame's light.
+    With it the frame can be carried to another pose.
     """
 
     picture: I420
     view: FieldView
     known_digest: bytes | None = None
-    """The picture's digest, where it was computed already."""
+    """The picture's digest, if it was computed already."""
     plain_render: I420 | None = None
-    """The render as the field shows it, where ``view`` has it under another light."""
+    """The field's own render, if ``view`` has it under another light."""
 
     @property
     def field_render(self) -> I420:
-        """The render as the field shows it, whatever the frame's light."""
+        """The field's own render, whatever the frame's light."""
         return self.view.render if self.plain_render is None else self.plain_render
 
     @cached_property
@@ -50,8 +50,8 @@ class Past:
 
 @dataclass(frozen=True)
 class EncoderState:
-    """The sender's state: the ``sequence`` its next packet gets within ``epoch``, and the frame
-    that packet may be predicted from, if any."""
+    """The sender's state: the sequence number of its next packet within ``epoch``, and the frame
+    that the packet may be predicted from, if any."""
 
     epoch: int
     next_sequence: int = 0
@@ -63,8 +63,8 @@ class EncoderState:
 
 @dataclass(frozen=True)
 class DecoderState:
-    """The receiver's state: the lowest ``sequence`` of ``epoch`` it still accepts, and the frames
-    it keeps, newest first."""
+    """The receiver's state: the lowest sequence number of ``epoch`` that it still accepts, and the
+    frames it keeps, newest first."""
 
     epoch: int
     next_sequence: int = 0

@@ -51,10 +51,10 @@ OWN_EFFORTS = ("fast", "default", "thorough")
 DEFAULT_EFFORT = "default"
 _X264 = "x264-"
 EFFORTS = (*OWN_EFFORTS, *(f"{_X264}{preset}" for preset in PRESETS))
-"""Of both coders."""
+"""The efforts of both coders."""
 
 CRF_RANGE = (1.0, 51.0)
-"""Below 1 x264 leaves High profile for lossless High 4:4:4, which needs other parameter sets."""
+"""Below a CRF of 1, x264 leaves High profile for lossless High 4:4:4 with other parameter sets."""
 
 MIN_SIDE_PX = 2
 MAX_SIDE_PX = 8192
@@ -62,15 +62,15 @@ MAX_MACROBLOCKS = 36_864
 """The largest picture of level 5.2: 4096x2304, or another shape of no more macroblocks."""
 
 PICTURES_PER_SECOND = 50
-"""The rate levels are chosen for: 25 frames, each with the I_PCM picture it predicts from."""
+"""The rate that levels are chosen for: 25 frames, each with the I_PCM picture it predicts from."""
 
 REFERENCE_FRAMES = 4
-"""Of one frame, at most. Fixed for a stream, so that its parameter sets serve any number up to it;
-streams of x264 have ``X264_REFERENCE_FRAMES``."""
+"""Most references of one frame. It is fixed for a stream, so that its parameter sets serve any
+number up to it; streams of x264 have ``X264_REFERENCE_FRAMES``."""
 X264_REFERENCE_FRAMES = 3
 
 DEFAULT_REFERENCES = 3
-"""How many an encoder chooses at most, unless it is told otherwise."""
+"""Most references that an encoder chooses, unless it is told otherwise."""
 
 _LEVELS = (
     (10, 1_485, 99, 396),
@@ -93,7 +93,7 @@ to the one before (2, 4.1) or need a constraint flag (1b)."""
 
 
 class Coder(StrEnum):
-    """What codes the slices."""
+    """The encoder of the slices."""
 
     OWN = "own"
     X264 = "x264"
@@ -105,12 +105,12 @@ def coder_of(effort: str) -> Coder:
 
 
 def effort_of_preset(preset: str) -> str:
-    """Return the effort that x264's ``preset`` is."""
+    """Return the effort of x264's ``preset``."""
     return f"{_X264}{preset}"
 
 
 def preset_of(effort: str) -> str:
-    """Return the x264 preset that ``effort`` is; raise ``InvalidInput`` for one of our coder."""
+    """Return the x264 preset of ``effort``; raise ``InvalidInput`` for an effort of our coder."""
     if coder_of(effort) is not Coder.X264:
         raise InvalidInput("effort", f"{effort!r} is no preset of x264")
     return effort.removeprefix(_X264)
@@ -167,7 +167,7 @@ class CodecConfig:
 
     @property
     def coder(self) -> Coder:
-        """What codes the slices."""
+        """The encoder of the slices."""
         return coder_of(self.effort)
 
     @property
@@ -187,12 +187,12 @@ class CodecConfig:
 
     @property
     def macroblocks(self) -> int:
-        """How many macroblocks a picture has."""
+        """The number of macroblocks of a picture."""
         return self.size_mbs[0] * self.size_mbs[1]
 
     @property
     def reference_frames(self) -> int:
-        """How many references a frame has at most, which the parameter sets say."""
+        """Most references of a frame, as the parameter sets say."""
         return REFERENCE_FRAMES if self.coder is Coder.OWN else X264_REFERENCE_FRAMES
 
     @property
@@ -209,7 +209,7 @@ class CodecConfig:
 
 
 class LightChange(StrEnum):
-    """Whether the light of a render may be changed before frames are predicted from it."""
+    """Permission to change the light of a render before frames are predicted from it."""
 
     AUTO = "auto"
     OFF = "off"
@@ -217,16 +217,16 @@ class LightChange(StrEnum):
 
 @dataclass(frozen=True)
 class CoderSettings:
-    """What codes the slices, and how hard it tries: the form on a command line."""
+    """The encoder of the slices and its effort, as options of a command line."""
 
     coder: Coder = Coder.OWN
     """own: this project's slice coder. x264: for comparison, through FFmpeg."""
     effort: str | None = None
-    """Of our coder: fast, default or thorough."""
+    """Effort of our own coder: fast, default or thorough."""
     preset: str | None = None
-    """With --coder x264: ultrafast to veryslow, normally medium."""
+    """x264's preset with --coder x264: ultrafast to veryslow, normally medium."""
     check_decode: bool = False
-    """Decode every slice on the vehicle, too, to see that it is what its coder promised."""
+    """Also decode every slice on the vehicle, and compare it with what its coder promised."""
     light: LightChange = LightChange.AUTO
     """auto: change the render's light to the frame's where that saves bits. off: predict from the
     render as it is."""

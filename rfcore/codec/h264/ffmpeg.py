@@ -1,7 +1,7 @@
-"""libx264 and FFmpeg's H.264 decoder, and frames as PyAV has them: the codec's only use of PyAV.
+"""libx264, FFmpeg's H.264 decoder, and PyAV frames; the only module of the codec that uses PyAV.
 
-Whatever changes x264's output is set here or is an argument. Threads work on whole pictures, never
-on parts of one: one picture is one slice.
+Everything that changes x264's output is set here or is an argument. Threads work on whole pictures,
+never on parts of one: one picture is one slice.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ SIGNAL = MappingProxyType(
 
 
 WHOLE_PICTURES = MappingProxyType({"sliced-threads": "0"})
-"""Without it the tune zerolatency divides a picture among threads, as several slices."""
+"""Without this option the tune zerolatency divides a picture into slices, one per thread."""
 
 QP_RANGE = 51
 
 
 class PictureKind(Enum):
-    """Which type of picture the encoder is told to make; ``CHOSEN`` leaves it to x264."""
+    """The type of a picture to encode; ``CHOSEN`` leaves it to x264."""
 
     CHOSEN = PictureType.NONE
     I = PictureType.I  # noqa: E741
@@ -225,7 +225,7 @@ def video_frame(
 
 
 def picture_of(frame: av.VideoFrame) -> I420:
-    """Return a copy of what a decoder showed, in 4:2:0."""
+    """Return a copy of a decoded 4:2:0 frame."""
     y, u, v = (_plane_view(plane).copy() for plane in frame.planes)
     return I420(y, u, v)
 

@@ -1,12 +1,12 @@
 """The stream header: what a receiver must know before the first packet, and its check.
 
 Every packet of a stream, at any effort, CRF and number of references, is coded under the same two
-parameter sets, so they travel once. There are two forms. Ours depends on the size alone: a receiver
-writes the sets itself and accepts no other byte. x264's, of ``--coder x264`` and of vehicles from
-before there was a slice coder, is accepted when it says what our settings make x264 write. Sets
-decide how much memory and how many reference pictures a decoder holds. Writing them is the inverse
-of the parsers of ``parameter_sets``: what those refuse (interlaced pictures, scaling matrices,
-slice groups, HRD) cannot be said. Clause numbers are those of ITU-T H.264 (08/2021).
+parameter sets, so they are sent once. There are two forms. Ours depends on the size alone: a
+receiver writes the sets itself and accepts no other byte. Those of ``--coder x264`` are accepted
+when they say what our settings make x264 write, because parameter sets decide how much memory and
+how many reference pictures a decoder holds. Writing is the inverse of the parsers of
+``parameter_sets``: what those refuse (interlaced pictures, scaling matrices, slice groups, HRD)
+cannot be written. Clause numbers are those of ITU-T H.264 (08/2021).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _NAL_REF_IDC = 3 << 5
 _HIGH_PROFILE = 100
 _POC_OF_DECODING_ORDER = 2
 _CROP_UNIT_PX = 2
-"""Of 4:2:0 frames, in both directions (7.4.2.1.1)."""
+"""Unit of cropping 4:2:0 frames, in both directions (7.4.2.1.1)."""
 _VIDEO_FORMAT_UNSPECIFIED = 5
 _LOG2_MAX_MV_LENGTH = 15
-"""The largest there is (E.2.1): the level says more."""
+"""The largest value that can be written (E.2.1); the level is stricter."""
 
 
 def sps_nal(sps: SequenceParameters) -> bytes:
@@ -83,7 +83,7 @@ def _write_crop(w: BitWriter, crop_px: tuple[int, int, int, int]) -> None:
 
 
 def _write_vui(w: BitWriter, vui: Vui) -> None:
-    """Write vui_parameters (E.1.1); nothing at all where ``vui`` has no value."""
+    """Write vui_parameters (E.1.1), or that there are none if ``vui`` is empty."""
     w.u(1, vui != Vui())
     if vui == Vui():
         return
@@ -117,7 +117,6 @@ def _write_restriction(w: BitWriter, vui: Vui) -> None:
 
 
 _BT709 = (1, 1, 1)
-_HIGH_PROFILE = 100
 _CHROMA_IN_THE_MIDDLE = 1
 """Chroma sample location type (figure E-1), as ``rfcore.native.yuv`` averages."""
 _LOG2_MAX_FRAME_NUM = 4
@@ -138,7 +137,7 @@ _OWN_PPS = PictureParameters(
     redundant_pictures=False,
     transform_8x8=True,
 )
-"""Three references is what most frames have: they need no override in the slice header."""
+"""The default is three references: most frames have three and then need no override."""
 _X264_PPS = replace(_OWN_PPS, weighted_pred=True)
 
 

@@ -31,7 +31,7 @@ NAL_P, NAL_IDR, NAL_SPS, NAL_PPS = 1, 5, 7, 8
 _EXTENDED_SAR = 255
 _HIGH_PROFILES = frozenset({100, 110, 122, 244})
 _MAX_HEADER_BYTES = 64
-"""No parameter set or slice header read here is longer."""
+"""Longest parameter set or slice header that is read."""
 
 
 @dataclass(frozen=True)

@@ -56,8 +56,11 @@ def pcm_pps() -> bytes:
 
 @dataclass(frozen=True)
 class PcmPlace:
-    """Where an I_PCM picture stands: ``frame_num`` 0 is an IDR picture, and then ``idr_pic_id``
-    must differ from that of an IDR picture right before it (7.4.3)."""
+    """The position of an I_PCM picture in its stream.
+
+    The one with ``frame_num`` 0 is an IDR picture; its ``idr_pic_id`` must differ from that of an
+    IDR picture right before it (7.4.3).
+    """
 
     log2_max_frame_num: int
     frame_num: int = 0
@@ -74,7 +77,7 @@ class PcmPictures:
     def access_unit(self, picture: I420, place: PcmPlace, sets: bytes = b"") -> memoryview:
         """Return the byte stream of a picture that decodes to ``picture``, samples raised to >= 1.
 
-        ``sets``: a byte stream to go before it. What is returned is overwritten by the next call.
+        ``sets``: a byte stream to put before it. The next call overwrites the returned memory.
         The coded area is the size rounded up to whole macroblocks by repeating the last row and
         column. The sequence must use picture order count type 2.
         """
@@ -108,7 +111,7 @@ def _samples_bytes(size_px: tuple[int, int]) -> int:
 
 
 def without_zeros(picture: I420) -> I420:
-    """Return ``picture`` with its samples raised to at least 1: what an I_PCM one decodes to."""
+    """Return ``picture`` with samples raised to at least 1, as its I_PCM picture decodes."""
     y, u, v = (np.maximum(plane, 1) for plane in picture.planes)
     return I420(y, u, v)
 

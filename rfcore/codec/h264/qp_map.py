@@ -1,4 +1,4 @@
-"""Where a frame is coded finer or coarser: an offset to the quantiser for each macroblock.
+"""A quantiser map: an offset for each macroblock, by which parts are coded finer or coarser.
 
 A map is int8 [rows, columns] of macroblocks of 16x16 px, added to the quantiser the CRF calls for;
 -6 halves its step. The slice carries every macroblock's quantiser itself, so no receiver needs the
@@ -61,7 +61,8 @@ class QpMap:
             raise InvalidInput("qp_map", f"offset {worst} is outside {low}..{high}")
 
     def regions(self) -> tuple[Region, ...]:
-        """Return rectangles that cover every offset but 0 once: runs of a row, grown downwards."""
+        """Return rectangles that cover every non-zero offset once: runs of a row, grown
+        downwards."""
         open_: dict[tuple[int, int, int], int] = {}
         regions: list[Region] = []
         for row in range(len(self.offsets) + 1):

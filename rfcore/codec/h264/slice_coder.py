@@ -31,25 +31,27 @@ from rfcore.native.backend import check_backend
 __all__ = ["Effort", "MacroblockMode", "OwnSlice", "SliceCoder"]
 
 LAMBDA_FACTOR = 0.59
-"""Squared error a bit is worth at QP 12; doubles every 3 steps of the quantiser. 0.68 takes 0.25 %
-more bits for the same squared error (a street with vehicles, 640x360), 0.53 as many."""
+"""Lambda at QP 12: the squared error that one bit is worth. It doubles every 3 steps of the
+quantiser. 0.68 takes 0.25 % more bits for the same squared error (a street with vehicles, 640x360),
+and so does 0.53."""
 MOTION_FACTOR = 1.4
-"""Times the root of that: transformed difference a bit is worth. 1.8 takes 0.1 to 1 % more bits and
-3 % less time (default effort; most at 30 Hz and high quantisers)."""
+"""Factor on the root of lambda for motion search, where a difference is a sum of absolute transform
+coefficients. A factor of 1.8 takes 0.1 to 1 % more bits and 3 % less time (default effort; most at
+30 Hz and high quantisers)."""
 MAX_QP = 60
-"""Beyond 51 only lambda grows: eight times the price of a bit, and little is left to code."""
+"""Highest QP. Beyond 51 only lambda grows, by up to eight times, until little is left to code."""
 _NAL_REF_IDC = 0x60
 _P_SLICE, _I_SLICE = 0, 2
 _ANY_MODE = -1
 
 
 class Trials(NamedTuple):
-    """What is tried for a macroblock; more costs time and saves bits."""
+    """The choices that are tried for a macroblock; more of them cost time and save bits."""
 
     search_steps: int
-    """Of the integer motion search."""
+    """Steps of the integer motion search."""
     subsample_steps: int
-    """Of the half- and quarter-sample search."""
+    """Steps of the half- and quarter-sample search."""
     references_reach: int
     """A partition's vector is refined in the references that cost at most this many percent of the
     best one; 100: in the best alone, 0: in all."""
@@ -60,20 +62,20 @@ class Trials(NamedTuple):
     """16x8 and 8x16 are tried where 8x8 blocks cost at most this many percent of 16x16; 0: always.
     """
     shapes_reach: int
-    """Partitions that cost at most this many percent of the cheapest are coded, too."""
+    """Partitions that cost at most this many percent of the cheapest are coded as well."""
     cost_rounds: int
-    """In how many rounds vectors are moved by a quarter sample where the whole macroblock, coded,
-    costs less then."""
+    """Rounds of moving vectors by a quarter sample wherever the coded macroblock then costs
+    less."""
 
 
 class Effort(Enum):
-    """How much is tried.
+    """How many choices are tried.
 
-    The default leaves out references that are 18 % behind: 10 % less time at 1280x720, 0.05 and
-    0.19 % more bits at equal squared error (sample drives); 110 takes 0.26 %. The two rounds of
-    ``THOROUGH`` nearly double its time and save 1.9 to 2.3 %; with one, the default would save 1.7
-    to 2.4 % and take half as much time again. Levels chosen along a trellis instead of one after
-    the other saved 0.1 % more beside them, and are not built.
+    The default leaves out references that cost 18 % more than the best: 10 % less time at 1280x720,
+    0.05 and 0.19 % more bits at equal squared error (sample drives); a reach of 110 takes 0.26 %.
+    The two rounds of ``THOROUGH`` nearly double its time and save 1.9 to 2.3 %; with one, the
+    default would save 1.7 to 2.4 % and take half as much time again. Levels chosen along a trellis
+    instead of one after the other saved 0.1 % more beside them, and are not built.
     """
 
     FAST = Trials(
@@ -106,8 +108,8 @@ class Effort(Enum):
 
 
 class MacroblockMode(IntEnum):
-    """What a macroblock is coded as: skipped, inter by its partitions, intra by its blocks, or its
-    samples as they are (I_PCM)."""
+    """The coding mode of a macroblock: skipped, inter with partitions, intra with blocks, or its
+    plain samples (I_PCM)."""
 
     SKIP = 0
     INTER_16X16 = 1
@@ -122,8 +124,8 @@ class MacroblockMode(IntEnum):
 
 @dataclass(frozen=True)
 class OwnSlice:
-    """A coded slice. ``payload``: its NAL unit without start code; ``reconstruction``: what
-    decoders make of it; ``modes`` [macroblocks]: the ``MacroblockMode`` of each, in raster order.
+    """A coded slice. ``payload``: its NAL unit without start code; ``reconstruction``: the picture
+    that decoders make of it; ``modes`` [macroblocks]: their ``MacroblockMode``, in raster order.
     """
 
     payload: bytes
@@ -134,8 +136,8 @@ class OwnSlice:
 class SliceCoder:
     """Codes pictures of one stream; may be shared between threads, which take turns.
 
-    ``threads``: how many work on rows of macroblocks at the same time, each row behind the one
-    above it; the bytes do not depend on it. Raises ``InvalidInput`` for a header that our streams
+    ``threads`` work on rows of macroblocks at the same time, each row behind the one above it; the
+    bytes do not depend on their number. Raises ``InvalidInput`` for a header that our streams
     would not have or a number of threads out of range, and ``BackendUnavailable``
     for an instruction set that this machine lacks.
     """

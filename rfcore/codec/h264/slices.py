@@ -55,10 +55,11 @@ _SUBME = {
     "slower": 9,
     "veryslow": 10,
 }
-"""Of x264's presets (x264 --fullhelp)."""
+"""Subpixel refinement of x264's presets (x264 --fullhelp)."""
 
 _TRELLIS = 2
-"""For every preset: 1 ms of 70 at veryfast, and 5 % fewer bits at equal PSNR."""
+"""Every preset uses trellis 2: it costs 1 ms of 70 at veryfast and saves 5 % of the bits at equal
+PSNR."""
 
 _REGIONS_ON = {"aq-mode": "1", "aq-strength": "0.0001"}
 
@@ -69,7 +70,7 @@ _PARTITIONS = {
     "slower": "all",
     "veryslow": "all",
 }
-"""Of x264's presets; no commas, which would end an option within a zone."""
+"""Partitions of x264's presets, without commas, which would end an option within a zone."""
 
 _UNSENT_MARGIN = 17
 """CRF less the quantiser of unsent pictures. On the first sample with three references, CRF 20 to
@@ -77,7 +78,8 @@ _UNSENT_MARGIN = 17
 more; of the time at CRF 29 they leave 85, 80, 75, 67 and 65 %."""
 
 _LOWEST_UNSENT_QP = 8
-"""Between 2 and 8 P slices change by 0.3 %, and the time of the unsent pictures by a fifth."""
+"""Lowest quantiser of unsent pictures. Between 2 and 8, P slices change by 0.3 %, and the time of
+the unsent pictures by a fifth."""
 
 
 _MAX_THREADS = 2
@@ -93,7 +95,7 @@ class CodedSlice:
 
 @dataclass(frozen=True)
 class SliceCoding:
-    """How one slice is coded. ``crf`` replaces the configured one, ``qp_map`` is added to it.
+    """Settings of one slice. ``crf`` replaces the configured one, ``qp_map`` is added to it.
 
     ``threads``: more than two gain nothing; with two the slice may differ by a few bytes, because
     x264 searches motion less far up and down.

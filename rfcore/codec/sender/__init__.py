@@ -1,1 +1,1 @@
-"""What only the sender needs: encoding, the choice of references, rate, ladder and poses."""
+"""The sender's part of the codec: encoding, the choice of references, rate control, the ladder."""

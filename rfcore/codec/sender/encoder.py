@@ -1,8 +1,8 @@
-"""The sender: codes frames as slices against pictures that both ends make themselves.
+"""The sender: codes frames as slices against pictures that both ends compute themselves.
 
-States are values: ``encode`` takes one and returns the next, and an error leaves the caller with
-the one it had. The object holds only the configuration and a decoder whose content does not
-outlive a frame. One caller at a time.
+States are values: ``encode`` takes one and returns the next, so an error leaves the caller's state
+as it was. The encoder object holds only the configuration and a decoder that keeps nothing from one
+frame to the next. One caller at a time.
 """
 
 from __future__ import annotations
@@ -51,45 +51,41 @@ from rfcore.views import FieldView
 
 __all__ = ["DeltaEncoder", "Encoded", "FrameChoice", "without_field"]
 
-Clock = Callable[[], int]
-
-
-def _stopped_clock() -> int:
-    return 0
-
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """How one frame is to be coded. Raises ``InvalidInput`` for what no frame can be."""
+    """How one frame is to be coded. Raises ``InvalidInput`` for choices that contradict each other
+    or are out of range."""
 
     references: References | None = None
-    """The pictures to predict from; ``None`` leaves it to the encoder."""
+    """The pictures to predict from; ``None`` leaves them to the encoder."""
     crf: float | None = None
     """Replaces the configured CRF."""
     photometric: Photometric | None = None
-    """The change of the render's light, see there; ``None`` leaves the light to the encoder."""
+    """The matrix that changes the render's light (``rfcore.codec.photometric``); ``None`` leaves
+    the light to the encoder."""
     relight: bool | None = None
-    """Map the render to the light of the earlier frame; ``None`` leaves it to the encoder where
-    ``photometric`` does."""
+    """Map the render to the light of the earlier frame; ``None`` leaves that to the encoder if
+    ``photometric`` does, too."""
     light: bytes = b""
     """With ``relight``: map the render to this light instead (``rfcore.codec.photometric``)."""
     pose_only: bool = False
-    """Send no slice: the frame is its only reference."""
+    """Send no slice: the receiver shows the only reference."""
     max_references: int = DEFAULT_REFERENCES
-    """How many the encoder may choose; of the usual three, one more under the light of the frame
-    before."""
+    """Most references that the encoder may choose. With the usual three, it may choose one more
+    under the light of the frame before."""
     block_means: bool = False
-    """Send those of the render, by which a receiver whose renderer is not exact tells rounding from
-    a wrong pose."""
+    """Send the render's block means, by which a receiver whose renderer is not exact tells rounding
+    from a wrong pose."""
     limit_bytes: int | None = None
     """A longer slice is coded again at higher CRFs (``rfcore.codec.sender.rate``); one that is too
     long even at the highest is returned all the same."""
     effort: str | None = None
-    """Replaces the configured effort, by another of the same coder."""
+    """Replaces the configured effort by another one of the same coder."""
     target: RateTarget | None = None
-    """Bytes aimed at, by a CRF that is predicted before coding and never below ``crf``."""
+    """The size to aim at by a CRF that is predicted before coding and never below ``crf``."""
     qp_map: QpMap | None = None
-    """Where the frame is coded finer or coarser."""
+    """Codes parts of the frame finer or coarser."""
 
     def __post_init__(self) -> None:
         if self.effort is not None:
@@ -116,9 +112,10 @@ LEFT_TO_THE_ENCODER = FrameChoice()
 
 
 def without_field(choice: FrameChoice, state: EncoderState) -> FrameChoice:
-    """Return the choice for a frame whose pose is not known: temporal, or intra without a past.
+    """Return the choice for a frame whose pose is unknown: it is predicted from the frame before,
+    or coded as an intra picture if there is none.
 
-    Its view is ``FieldView.nothing``. Frames after it may use the field again at once.
+    Its view is ``FieldView.nothing``. The next frame may use the field again.
     """
     references = INTRA if state.past is None else (Reference.PREVIOUS,)
     return replace(choice, references=references, photometric=(), relight=False)
@@ -126,12 +123,12 @@ def without_field(choice: FrameChoice, state: EncoderState) -> FrameChoice:
 
 @dataclass(frozen=True)
 class Encoded:
-    """A packet, what the receiver will see, and the sender's next state.
+    """A packet, the picture that the receiver will show, and the sender's next state.
 
-    ``stage_ns`` has "references" (warp, choice), "encode" (the slice) and "closed_loop" (digests,
-    and decoding as the receiver does where that is needed). ``tries``: how often the frame was
-    coded to fit a limit. ``crf``: the one it was coded at in the end. ``rate``: the target's model
-    with this frame learnt.
+    ``stage_ns`` has the times of "references" (warp, choice), "encode" (the slice) and
+    "closed_loop" (digests, and decoding where that is needed). ``tries``: how many times the frame
+    was coded to fit a limit. ``crf``: the CRF of the last try. ``rate``: the target's model,
+    updated by this frame.
     """
 
     packet: DeltaPacket
@@ -145,7 +142,7 @@ class Encoded:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """What a frame is predicted from: ``pictures`` are ``references`` of ``prediction``."""
+    """The references chosen for a frame, and their ``pictures``."""
 
     prediction: Prediction
     references: References
@@ -153,7 +150,7 @@ class _Plan:
 
     @property
     def needs_base(self) -> bool:
-        """Whether the receiver needs the earlier frame."""
+        """True if the receiver needs the earlier frame."""
         return self.prediction.learns_light or is_temporal(self.references)
 
 
@@ -161,16 +158,16 @@ class DeltaEncoder:
     """Codes frames one by one. Raises ``CodecError`` if x264 writes other parameter sets than the
     configuration calls for.
 
-    ``threads`` are for making references and coding. References and our coder's slices are the same
-    with any number; x264's may differ by a few bytes between one and more. ``check_decode``: decode
-    what our coder makes, and raise ``CodecError`` unless the picture is the one it promised; x264's
-    slices are always decoded.
+    ``threads`` make references and code. References and our coder's slices do not depend on their
+    number; x264's slices may differ by a few bytes between one thread and more. ``check_decode``:
+    decode the slices of our coder, too, and raise ``CodecError`` unless the picture is the promised
+    one; x264's slices are always decoded.
     """
 
     def __init__(
         self,
         config: CodecConfig,
-        clock_ns: Clock = _stopped_clock,
+        clock_ns: Callable[[], int] = lambda: 0,
         threads: int = 1,
         *,
         check_decode: bool = False,
@@ -189,7 +186,7 @@ class DeltaEncoder:
 
     @property
     def header(self) -> StreamHeader:
-        """What a receiver needs before the first packet."""
+        """The stream header, which a receiver needs before the first packet."""
         return self._coder.header
 
     def start(self, epoch: int) -> EncoderState:
@@ -206,9 +203,9 @@ class DeltaEncoder:
     ) -> Encoded:
         """Code ``frame`` against ``view``, the field at its pose, and ``state.past``.
 
-        ``costs``: those of this very frame, where some are known already. Raises ``InvalidInput``
-        for a frame or view that is not of the configured size, or references that cannot be made;
-        ``CodecError`` if coding fails.
+        ``costs``: those of this very frame, if some are known already. Raises ``InvalidInput`` for
+        a frame or view that is not of the configured size, or references that cannot be computed,
+        and ``CodecError`` if coding fails.
         """
         self._check(frame, view, choice)
         started_ns = self._clock_ns()
@@ -251,7 +248,7 @@ class DeltaEncoder:
     def _plan(
         self, state: EncoderState, view: FieldView, choice: FrameChoice, costs: FrameCosts
     ) -> _Plan:
-        """Return what to predict the frame from, choosing what ``choice`` leaves open."""
+        """Return the plan for a frame: what ``choice`` says, and for the rest what costs least."""
         crf = self._first_crf(choice)
         prediction = self._under_light(state, view, choice, costs, crf)
         references = choice.references
@@ -267,7 +264,8 @@ class DeltaEncoder:
         costs: FrameCosts,
         crf: float,
     ) -> Prediction:
-        """Return the prediction under the light that ``choice`` names, or that pays."""
+        """Return the prediction under the light of ``choice``, or under the one that costs
+        least."""
         past = state.past
         if choice.relight:
             return Prediction.relit(view, past, self._threads, choice.light)
@@ -286,7 +284,7 @@ class DeltaEncoder:
     def _under_sent_light(
         self, changed: Prediction, view: FieldView, costs: FrameCosts, crf: float
     ) -> Prediction:
-        """Return the prediction under a light that is sent, or ``changed`` if that is cheaper."""
+        """Return the prediction under a light to be sent, or ``changed`` if that is cheaper."""
         light = sent_light(costs.frame, view.render)
         if not light:
             return changed
@@ -295,7 +293,7 @@ class DeltaEncoder:
         return relit if pays else changed
 
     def _first_crf(self, choice: FrameChoice) -> float:
-        """Return the CRF that references are chosen for: with a target, about the one to come."""
+        """Return the CRF for choosing references: with a target, the last frame's at least."""
         lowest = self._config.crf if choice.crf is None else choice.crf
         if choice.target is None or choice.target.model.crf is None:
             return lowest
@@ -304,7 +302,7 @@ class DeltaEncoder:
     def _coded(
         self, costs: FrameCosts, plan: _Plan, choice: FrameChoice
     ) -> tuple[FittedSlice, RateModel | None]:
-        """Return the slice at the CRF asked for, or at the one that a target calls for."""
+        """Return the slice at the chosen CRF, or at the one that the target needs."""
         lowest = self._config.crf if choice.crf is None else choice.crf
         target = choice.target
         if target is None or choice.pose_only:
@@ -332,7 +330,7 @@ class DeltaEncoder:
         return self._coder.code(frame, pictures, asked)
 
     def _reconstruction(self, pictures: tuple[I420, ...], coded: CodedPicture) -> I420:
-        """Return what the receiver will see; decode only where the coder does not say."""
+        """Return the receiver's picture; decode only if the coder does not know it."""
         if not coded.payload:
             return without_zeros(pictures[0])
         promised = coded.reconstruction
@@ -346,7 +344,7 @@ class DeltaEncoder:
 
 
 def _may_learn_light(choice: FrameChoice) -> bool:
-    """A frame that is to need its render alone has no earlier one to learn the light from."""
+    """Return whether the light may be learnt; not if the caller wants no earlier frame used."""
     return choice.relight is None and (choice.references is None or is_temporal(choice.references))
 
 

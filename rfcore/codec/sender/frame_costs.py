@@ -1,4 +1,4 @@
-"""What a frame costs when its 8x8 luma blocks are predicted from a picture: D + lambda R.
+"""Estimates the cost D + lambda R of a frame whose 8x8 luma blocks are predicted from a picture.
 
 Coding with every set of references and comparing would take a run of the coder each, and comparing
 bytes at equal CRF would mislead, since a better reference also gives a better picture at the same
@@ -81,7 +81,7 @@ class FrameCosts:
 
     @cached_property
     def intra(self) -> BlockCosts:
-        """The costs of predicting each block from its own mean, for want of any reference."""
+        """The costs of predicting each block from its own mean, as without any reference."""
         return block_costs(self.frame.y, _at_block_means(self.frame.y))
 
 

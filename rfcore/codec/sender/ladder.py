@@ -1,10 +1,10 @@
-"""The ladder of accuracy and time: settings of the sender, and what each was measured to cost.
+"""The ladder of accuracy and time: settings of the sender, and the measured cost of each.
 
-A rung is everything a sender may decide about a frame except its CRF. What the receiver must know
-of it (how the field is rendered, which references) travels with each frame, so every frame may be
-coded at another rung than the one before. ``rfedge eval ladder`` measures rungs and writes the file
-that ``read_ladder`` reads. A sender that finds its poses in the field has tracking to decide
-about, too: each effort of it has times and rates of its own, which are added to a rung's.
+A rung is everything a sender may decide about a frame except its CRF. The receiver's part of it
+(how the field is rendered, which references) is sent with each frame, so every frame may be coded
+at another rung. ``rfedge eval ladder`` measures rungs and writes the file that ``read_ladder``
+reads. A sender that finds its poses in the field also chooses an effort of tracking, whose measured
+times and rates are added to a rung's.
 """
 
 from __future__ import annotations
@@ -40,40 +40,40 @@ __all__ = [
 
 
 class TrackingEffort(StrEnum):
-    """How hard a frame's pose is looked for in the field, where that is done; the best first."""
+    """The effort of finding a frame's pose in the field, for senders that do; the best first."""
 
     FULL = "full"
-    """The field is drawn again where the pose of the first render turns out to be off."""
+    """The field is rendered again if the pose of the first render turns out to be wrong."""
     ONCE = "once"
-    """It is drawn once."""
+    """The field is rendered once."""
     HALF = "half"
-    """It is drawn once, and aligned with the frame from half the resolution on."""
+    """The field is rendered once, and aligned with the frame at half the resolution or less."""
 
     @property
     def redraws(self) -> int:
-        """Renders beyond one, at most."""
+        """Most renders beyond the first."""
         return int(self is TrackingEffort.FULL)
 
     @property
     def finest_level(self) -> int:
-        """The finest level of the pyramids that are aligned; each has half the last resolution."""
+        """The finest level of the image pyramids to align; each level halves the resolution."""
         return int(self is TrackingEffort.HALF)
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One setting of the sender; raises ``InvalidInput`` for one that is not."""
+    """One setting of the sender; raises ``InvalidInput`` for values out of range."""
 
     quality: Quality = FULL
-    """How the field is rendered, on both ends."""
+    """The quality of the field's render, on both ends."""
     references: int = DEFAULT_REFERENCES
-    """At most so many pictures are predicted from; 0: the render alone, as the paper has it."""
+    """Most pictures to predict from; 0 is the render alone, as in the paper."""
     photometric: bool = True
-    """Whether a change of light is looked for."""
+    """Search for a change of light."""
     effort: str = DEFAULT_EFFORT
-    """How hard the coder tries."""
+    """The effort of the coder."""
     tracking: TrackingEffort = TrackingEffort.FULL
-    """How hard the pose is looked for, by a sender that does."""
+    """The effort of finding the pose, for a sender that does."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.references <= REFERENCE_FRAMES:
@@ -84,7 +84,7 @@ class Rung:
 
     @property
     def name(self) -> str:
-        """The rung in words, as tables, logs and metrics show it: ``50% sh1 2ref fast``."""
+        """The rung in words for tables, logs and metrics: ``50% sh1 2ref fast``."""
         parts = [quality_name(self.quality)]
         parts.append(f"{self.references}ref" if self.references else "render-only")
         if not self.photometric:
@@ -108,14 +108,14 @@ def quality_name(quality: Quality) -> str:
 
 
 FULL_RUNG = Rung()
-"""The best there is, at the default effort."""
+"""The best quality, at the default effort."""
 
 
 @dataclass(frozen=True)
 class MeasuredRung:
-    """A rung with its milliseconds a frame, of one thread, and its rate.
+    """A rung with its milliseconds a frame on one thread, and its rate.
 
-    ``rate_percent``: bits at equal quality, more (+) or fewer (-) than the ladder's first rung.
+    ``rate_percent``: how many percent more bits it takes at equal quality than the first rung.
     """
 
     rung: Rung
@@ -147,9 +147,9 @@ def read_ladder(
 ) -> tuple[MeasuredRung, ...]:
     """Return the front of the rungs measured for a field of ``kind`` at the CRF nearest ``crf``.
 
-    ``tracking``: the sender finds its poses in the field; each rung comes with every effort of
-    tracking that was measured to work at its quality. Raises ``InvalidData`` naming the file if it
-    is no ladder, or has nothing for such a field and coder, or no times of tracking.
+    ``tracking``: the sender finds its poses in the field; each rung is combined with every effort
+    of tracking that worked at its quality. Raises ``InvalidData`` naming the file if it is no
+    ladder, or has nothing for such a field and coder, or no times of tracking.
     """
     try:
         result = json.loads(path.read_text())
@@ -171,7 +171,7 @@ def read_ladder(
 
 
 def _is_for(stored: Mapping[str, Any], kind: str, coder: Coder) -> bool:
-    """Tell whether a row was measured for that kind of field and coder."""
+    """Return whether a row was measured for that kind of field and coder."""
     return stored["kind"] == kind and coder_of(stored["effort"]) is coder
 
 

@@ -31,7 +31,7 @@ sample drive, 6.8 on the one with vehicles, from CRF 15 to 40."""
 
 @dataclass(frozen=True)
 class Asked:
-    """How one picture is to be coded; ``effort`` is one of the stream's coder."""
+    """The settings of one picture; ``effort`` is one of the stream's coder."""
 
     crf: float
     effort: str
@@ -40,7 +40,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class CodedPicture:
-    """A slice NAL unit, and what decoders make of it; ``None`` where only a decoder can tell."""
+    """A slice NAL unit and its decoded picture; ``None`` where only a decoder can tell."""
 
     payload: bytes
     reconstruction: I420 | None = None
@@ -61,7 +61,7 @@ class PictureCoder(Protocol):
 
 
 def picture_coder(config: CodecConfig, threads: int = 1) -> PictureCoder:
-    """Return the coder that the configuration's effort is one of."""
+    """Return the coder of the configuration's effort."""
     if config.coder is Coder.X264:
         return _X264PictureCoder(config, threads)
     return _OwnPictureCoder(config, threads)

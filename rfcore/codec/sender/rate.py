@@ -1,9 +1,9 @@
-"""Rate control of one frame: how long a slice will be at which CRF, and coding until it fits.
+"""Rate control of one frame: predicts the size of a slice at each CRF, and codes until it fits.
 
-The bits of a frame at every CRF are estimated from what its references leave of each 8x8 block
-(``rfcore.codec.sender.frame_costs`` has the formula); what the coder makes of it differs by a
-factor that changes little from one frame to the next of the same references. ``RateModel`` keeps
-that factor for each set of references. States are values: ``after`` returns the next.
+The bits of a frame at every CRF are estimated from the residual of each 8x8 block
+(``rfcore.codec.sender.frame_costs`` has the formula). The coded size differs from the estimate by a
+factor that changes little between frames of the same references. ``RateModel`` keeps that factor
+for each set of references. States are values: ``after`` returns the next.
 
 A slice that is longer than a limit is coded again at a higher CRF until it fits (``code_to_fit``).
 6 of CRF double the quantiser's step and, in pictures of a street, about halve the bits; in noise
@@ -42,13 +42,13 @@ __all__ = [
 
 CRF_STEP = 1.0
 LEAST_BITS = 400.0
-"""A slice in which every block is copied from reference 0: its header and a run of skips, and what
-an estimate block by block does not see. With 200 the sample's drive with vehicles misses its
+"""Bits of a slice in which every block is copied from reference 0: a header, a run of skips, and an
+allowance for what the estimate misses. With 200, the sample's drive with vehicles misses its
 targets by 5.4 % in the median instead of 4.5."""
 MEMORY = 0.5
-"""Weight of what was known of the factor, when a frame was coded."""
+"""Weight of the factor so far when a coded frame corrects it."""
 CLIMB_CRF = 2.0
-"""Quality rises by at most so much a frame, against flicker, but falls at once."""
+"""Most that the CRF may fall from one frame to the next, against flicker; it may rise at once."""
 Array = NDArray[np.float64]
 
 
@@ -64,7 +64,7 @@ class BitsCurve:
         return float(2 ** np.interp(crf, self.crfs, np.log2(self.bits)))
 
     def crf_for(self, bits: float) -> float:
-        """Return the lowest CRF of at most ``bits``; the highest there is when none has."""
+        """Return the lowest CRF that takes at most ``bits``, or the highest CRF if none does."""
         falling = np.log2(self.bits)
         if math.log2(max(bits, 1.0)) >= falling[0]:
             return float(self.crfs[0])
@@ -119,20 +119,20 @@ def _coded_bits(satd: Array, ssd: Array, crf: float) -> float:
 
 @dataclass(frozen=True)
 class RateModel:
-    """Learnt from coded frames: ``octaves``, log2 of coded over estimated bits, by references.
+    """What coded frames have taught: ``octaves``, log2 of coded over estimated bits, by references.
 
-    ``crf`` is that of the last frame, which bounds how fast quality rises; None before the first.
+    ``crf`` is that of the last frame, which limits how fast quality rises; None before the first.
     """
 
     octaves: Mapping[References, float] = field(default_factory=dict)
     crf: float | None = None
 
     def bytes_at(self, crf: float, curve: BitsCurve, references: References) -> float:
-        """Return how long a slice is predicted to be."""
+        """Return the predicted size of a slice in bytes."""
         return curve.at(crf) / 8 * 2 ** self._octaves_of(references)
 
     def crf_for(self, size_bytes: float, curve: BitsCurve, references: References) -> float:
-        """Return the CRF that ``size_bytes`` call for, not below the curve's first."""
+        """Return the CRF predicted to give ``size_bytes``, not below the curve's first."""
         wanted = curve.crf_for(8 * size_bytes / 2 ** self._octaves_of(references))
         slowest = wanted if self.crf is None else max(wanted, self.crf - CLIMB_CRF)
         return min(max(slowest, float(curve.crfs[0])), CRF_RANGE[1])
@@ -149,7 +149,7 @@ class RateModel:
         return RateModel({**self.octaves, references: octaves}, crf)
 
     def _octaves_of(self, references: References) -> float:
-        """Return the factor of ``references``, or of the known ones that are most like them."""
+        """Return the factor of ``references``, or of the most similar known set."""
         if not self.octaves:
             return 0.0
         like = max(self.octaves, key=lambda known: _likeness(known, references))
@@ -163,7 +163,7 @@ def _likeness(known: References, wanted: References) -> tuple[bool, int]:
 
 @dataclass(frozen=True)
 class RateTarget:
-    """The size to aim at, ``size_bytes``, and the ``model`` that finds the CRF for it."""
+    """The size to aim at, and the ``model`` that finds the CRF for it."""
 
     size_bytes: float
     model: RateModel = RateModel()
@@ -174,18 +174,18 @@ class RateTarget:
 
 
 MAX_TRIES = 5
-"""Codings of one frame; the last is at the highest CRF there is."""
+"""Most codings of one frame; the last is at the highest CRF."""
 MIN_HALVING_CRF = 6.0
 MAX_HALVING_CRF = 48.0
-"""CRF steps that are assumed to halve a slice, at the least and at the most."""
+"""Fewest and most CRF steps that are assumed to halve a slice."""
 AIM = 0.95
-"""Share of the limit that a step aims at: aiming low costs a little, a miss costs a coding."""
+"""Share of the limit to aim at: aiming low costs few bits, a miss costs one more coding."""
 Code = Callable[[float], CodedPicture]
 
 
 @dataclass(frozen=True)
 class FittedSlice:
-    """A slice, the CRF it was coded at, and how often the frame was coded for it."""
+    """A slice, the CRF it was coded at, and how many times the frame was coded."""
 
     coded: CodedPicture
     crf: float
@@ -195,7 +195,7 @@ class FittedSlice:
 def code_to_fit(code: Code, crf: float, limit_bytes: int) -> FittedSlice:
     """Return ``code`` at ``crf``, or at the lowest of a few higher ones that fits ``limit_bytes``.
 
-    What does not fit at the highest CRF is returned as it is: check the length.
+    A slice that does not fit even at the highest CRF is returned all the same: check the length.
     """
     coded = code(crf)
     halving = MIN_HALVING_CRF

@@ -1,8 +1,9 @@
-"""What the sender decides about a frame before it codes it: references, and the render's light.
+"""Decides before a frame is coded which references it has, and under which light its render is.
 
-Both are decided by the estimate of D + lambda R that ``rfcore.codec.sender.frame_costs`` makes of
-each 8x8 block. There is no motion in it: the pictures made from the field stand where the frame
-stands. The previous frame does not, and the coder searches it: it is taken whenever there is one.
+Both decisions rest on the estimate of D + lambda R that ``rfcore.codec.sender.frame_costs`` makes
+for each 8x8 block. It includes no motion: pictures made from the field are aligned with the frame.
+The previous frame is not, but the coder searches motion in it, so it is taken whenever there is
+one.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.codec.block_means import block_mean_digest
+from rfcore.codec.block_means import median_block_mean_difference
 from rfcore.codec.h264.config import DEFAULT_REFERENCES
 from rfcore.codec.photometric import Photometric, adapt, solve
 from rfcore.codec.prediction import Prediction
@@ -30,29 +31,30 @@ __all__ = [
 ]
 
 INDEX_BITS = 1.0
-"""What naming another reference than the first costs a block."""
+"""Bits that a block pays for another reference than the first."""
 
 USELESS_INTRA_RATIO = 1.2
-"""Of the cost of intra prediction: beyond it no picture of the field helps. P slices can predict
-blocks from their neighbours too, so a picture that helps a few blocks does no harm."""
+"""A picture that costs more than this share of intra prediction does not help. P slices can also
+predict blocks from their neighbours, so a picture that helps a few blocks does no harm."""
 MIN_SAVING = 0.002
-"""Of the cost so far: another reference must save at least so much."""
+"""Share of the cost so far that another reference must save."""
 
 GOOD_INTRA_RATIO = 0.9
-"""Of the cost of intra prediction: what an adapted render must stay below. Where the light of a
-whole street was changed it reaches 0.75, as in the right light; a field of noon at dusk 1.2."""
+"""An adapted render must cost less than this share of intra prediction. It costs 0.75 where the
+light of a whole street was changed, as much as in the right light, and 1.2 with a field of noon at
+dusk."""
 
 SENT_LIGHT_INTRA_RATIO = 1.15
-"""Of the cost of intra prediction: up to which a light is sent. At dusk with a field of noon it is
-0.94 to 1.05 for the yardstick's first frame, which takes 15 to 32 % fewer bits with the light, and
-1.10 to 1.40 for one half way (7 to 18 %); with the field of another street 1.23 and more, and 4 to
-16 % more bits."""
+"""A light is sent if the render then costs less than this share of intra prediction. At dusk with a
+field of noon the share is 0.94 to 1.05 for the benchmark street's first frame, which takes 15 to
+32 % fewer bits with the light, and 1.10 to 1.40 for a frame half way (7 to 18 %); with the field of
+another street it is 1.23 and more, and frames take 4 to 16 % more bits."""
 
 NOTICEABLE_LEVELS = 4
-"""Median difference of block means from which a change of light is looked for. In a field's own
-light it is 0 to 1 on the yardstick street and up to 2.5 on the sample drive with vehicles, where
-from 2 levels on the frames that were relit took 2 to 4 % more bytes. Drifting exposure is 22 %
-cheaper than with ``off`` from 4 levels on, 25 % from 2."""
+"""Median difference of block means above which a change of light is looked for. In a field's own
+light it is 0 to 1 on the benchmark street and up to 2.5 on the sample drive with vehicles, where
+with a threshold of 2 levels relit frames took 2 to 4 % more bytes. Frames of drifting exposure take
+22 % fewer bytes than without a change of light; with a threshold of 2 levels 25 % fewer."""
 PHOTOMETRIC_BITS = 12 * 16
 
 Costs = NDArray[np.float64]
@@ -63,12 +65,14 @@ def choose_references(
 ) -> References:
     """Return at most ``max_references`` references for a frame, the most useful last.
 
-    That is the render or the correction. The previous frame comes next, then the other one; the
-    warp only as a fourth (0.4 and 0.9 % fewer bits, a seventh more of the sender's time on the
-    sample drives). It is never last: what skipped blocks copy from it drifts from frame to frame.
+    The most useful is the render or the correction. The previous frame comes next, then the other
+    one of the two; the warp only as a fourth (0.4 and 0.9 % fewer bits on the sample drives for a
+    seventh more of the sender's time). The warp is never last: skipped blocks that copy it drift
+    from frame to frame.
 
-    Under the light of the frame before the usual three become four: what the field does not show is
-    in earlier frames alone (2.2 % fewer bits on the yardstick's dusk with a field of noon).
+    Under the light of the frame before, four are taken instead of three, since only earlier frames
+    show what the field does not (2.2 % fewer bits on the benchmark street at dusk with a field of
+    noon).
     """
     if prediction.learns_light and max_references == DEFAULT_REFERENCES:
         max_references += 1
@@ -93,7 +97,7 @@ def choose_references(
 def _usable(
     costs: FrameCosts, prediction: Prediction, at_crf: RateDistortion
 ) -> dict[Reference, Costs]:
-    """Return the costs of the blocks against the pictures that may be reference 0."""
+    """Return the costs of the blocks for each picture that may be reference 0."""
     usable = {Reference.RENDER: at_crf.coded_or_copied(costs.against(prediction.render))}
     if Reference.CORRECTION in prediction.available:
         found = costs.against(prediction.correction)
@@ -106,22 +110,22 @@ def _saves(best: Costs, other: Costs) -> bool:
 
 
 def _in_order(references: Sequence[Reference]) -> list[Reference]:
-    """Return them as they are fed: the warp before the field's other picture."""
+    """Return the references in the order in which they are fed to the decoder."""
     order = (Reference.PREVIOUS, Reference.WARP, Reference.RENDER, Reference.CORRECTION)
     return [reference for reference in order if reference in references]
 
 
 def light_differs(frame: I420, render: I420) -> bool:
-    """Tell whether a change of the render's light is worth looking for."""
+    """Return whether a change of the render's light is worth looking for."""
     is_large_enough = min(frame.size_px) >= BLOCK_PX
-    return is_large_enough and _light_difference(frame, render) >= NOTICEABLE_LEVELS
+    return is_large_enough and median_block_mean_difference(frame, render) >= NOTICEABLE_LEVELS
 
 
 def choose_photometric(costs: FrameCosts, render: I420, crf: float) -> Photometric:
-    """Return how the render's light is to be changed, if that saves more than it costs to say.
+    """Return the matrix for the render's light, if it saves more bits than it takes; else nothing.
 
-    It must make a good reference of the render: shadows that have moved and lamps that were lit are
-    beyond one matrix, and half a change of light only disturbs what is carried from frame to frame.
+    The adapted render must be a good reference. One matrix cannot describe moved shadows or lit
+    lamps, and half a change of light only disturbs what is carried from frame to frame.
     """
     found = solve(costs.frame, render)
     at_crf = RateDistortion.at(crf)
@@ -131,12 +135,12 @@ def choose_photometric(costs: FrameCosts, render: I420, crf: float) -> Photometr
 
 
 def relighting_pays(costs: FrameCosts, render: I420, relit: I420, crf: float) -> bool:
-    """Tell whether the relit render makes blocks noticeably cheaper; to say so costs next to
-    nothing.
+    """Return whether the relit render makes blocks noticeably cheaper; signalling it is nearly
+    free.
 
-    It must beat intra prediction: of a field that does not show what is there the grid makes a
+    It must beat intra prediction: if the field does not show what is there, relighting gives a
     blurred copy of the earlier frame, which is a reference already. At dusk with a field of noon
-    the cost is 0.86 to 0.93 of intra prediction's, from a wrong pose 1.14 and more.
+    the cost is 0.86 to 0.93 of intra prediction's; with a wrong pose it is 1.14 and more.
     """
     as_it_is, adapted, intra = _totals(costs, render, relit, RateDistortion.at(crf))
     return adapted < min((1 - MIN_SAVING) * as_it_is, intra)
@@ -145,8 +149,8 @@ def relighting_pays(costs: FrameCosts, render: I420, relit: I420, crf: float) ->
 def sending_light_pays(
     costs: FrameCosts, changed: Prediction, relit: Prediction, crf: float
 ) -> bool:
-    """Tell whether the light of ``relit``, which is sent, makes the first frame of a stream cheaper
-    than it is with ``changed``: by a matrix, or not at all."""
+    """Return whether sending the light of ``relit`` makes the first frame of a stream cheaper than
+    ``changed``, whose light is changed by a matrix or not at all."""
     at_crf = RateDistortion.at(crf)
     as_it_is, in_light, intra = _totals(costs, changed.render, relit.render, at_crf)
     told = at_crf.bit_price * (8 * len(relit.light) - PHOTOMETRIC_BITS * bool(changed.photometric))
@@ -156,7 +160,7 @@ def sending_light_pays(
 def _totals(
     costs: FrameCosts, render: I420, adapted: I420, at_crf: RateDistortion
 ) -> tuple[float, float, float]:
-    """Return what all blocks cost against the render as it is, in another light, and intra."""
+    """Return the cost of all blocks with the plain render, with the adapted one, and intra."""
     as_it_is, in_light, intra = (
         _total(at_crf.coded_or_copied(blocks))
         for blocks in (costs.against(render), costs.against(adapted), costs.intra)
@@ -166,9 +170,3 @@ def _totals(
 
 def _total(costs: Costs) -> float:
     return float(costs.sum())
-
-
-def _light_difference(frame: I420, render: I420) -> float:
-    """Return the median difference of 64 block means; what is not in the field moves few."""
-    a, b = (np.frombuffer(block_mean_digest(p), np.uint8).astype(int) for p in (frame, render))
-    return float(np.median(np.abs(a - b)))
