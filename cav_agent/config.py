@@ -93,8 +93,9 @@ class AgentConfig:
     deadline_ms: float | None = None
     """Milliseconds a frame may take on this machine, from the picture to the packet: the best rung
     of the ladder that keeps it is used, a lower one under load, in place of the effort."""
-    ladder: Path = Path("lab/results/ladder.json")
-    """Times and rates of the rungs, as `rfedge eval ladder` measured them."""
+    ladder: Path | None = None
+    """The rungs with their times and rates, as `rfedge eval ladder` measured them; default: those
+    that ship, measured on the sample street."""
     steering: SteeringSettings = SteeringSettings()
     notices: Path | None = None
     """Ask servers what others see ahead and what changed about the map, and hand it on: a Unix

@@ -14,6 +14,7 @@ import itertools
 from collections import OrderedDict
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -45,6 +46,7 @@ from rfcore.views import PosedPicture
 from rfcore.wire.tiles import Tile
 
 __all__ = [
+    "SHIPPED_LADDER",
     "FieldCache",
     "PreparedCamera",
     "PreparedField",
@@ -52,6 +54,9 @@ __all__ = [
 ]
 
 log = structlog.get_logger()
+
+SHIPPED_LADDER = Path(__file__).with_name("ladder.json")
+"""Rungs measured on the sample street with the field that ships (`rfedge eval ladder`)."""
 
 OWN_AGAIN_S = 10.0
 """From a failure to fetch a tile's own field to the next try, while something is drawn."""
@@ -291,7 +296,8 @@ class FieldCache:
         if config.deadline_ms is None:
             return ()
         kind, coder = field.metadata.kind, config.coding.coder
-        return read_ladder(config.ladder, kind, config.crf, coder, tracking=config.localise)
+        ladder = config.ladder or SHIPPED_LADDER
+        return read_ladder(ladder, kind, config.crf, coder, tracking=config.localise)
 
     def _rungs(self, ladder: tuple[MeasuredRung, ...]) -> Rungs:
         """Return how frames are coded."""

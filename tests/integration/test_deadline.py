@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from cav_agent.field_cache import SHIPPED_LADDER
+from rfcore.codec.sender.ladder import read_ladder
 from rfcore.errors import InvalidData
 
 FULL, LOW = "100% 3ref fast", "10% sh0 render-only fast"
@@ -26,7 +28,7 @@ def write_ladder(path: Path, full_ms: float, low_ms: float) -> Path:
         return {"settings": settings, "sender_ms": ms, "receiver_ms": 1.0, "rate_percent": rate}
 
     rows = [row(full_ms, 0.0), row(low_ms, 90.0, detail=0.1, sh_degree=0, references=0)]
-    path.write_text(json.dumps({"kind": "ladder", "rows": rows}))
+    path.write_text(json.dumps({"kind": "ladder", "rows": rows, "tracking": []}))
     return path
 
 
@@ -101,3 +103,10 @@ async def test_a_deadline_without_a_ladder_says_how_to_make_one(
     async with serve() as server:
         with pytest.raises(InvalidData, match=r"nowhere\.json.*rfedge eval ladder"):
             await travel(server.address, deadline_ms=33.0, ladder=tmp_path / "nowhere.json")
+
+
+async def test_a_deadline_alone_takes_the_ladder_that_ships(serve: Any, travel: Any) -> None:
+    async with serve() as server:
+        record = await travel(server.address, deadline_ms=60_000.0)
+    best = read_ladder(SHIPPED_LADDER, "splats", 23.0)[0]
+    assert record.lines[0]["rung"] == best.rung.name
