@@ -12,7 +12,7 @@ from tyro.conf import Suppress, arg
 from cav_agent.live.settings import LiveSettings
 from cav_agent.pose_feed.settings import PoseFeedSettings
 from rfcore.codec.h264.config import CRF_RANGE, CoderSettings
-from rfcore.codec.sender.steering import SteeringSettings
+from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
@@ -96,7 +96,7 @@ class AgentConfig:
     ladder: Path | None = None
     """The rungs with their times and rates, as `rfedge eval ladder` measured them; default: those
     that ship, measured on the sample street."""
-    steering: SteeringSettings = SteeringSettings()
+    masking: MaskSettings = MaskSettings()
     notices: Path | None = None
     """Ask servers what others see ahead and what changed about the map, and hand it on: a Unix
     socket at this path that gives its readers a line of JSON for each notice
@@ -122,7 +122,7 @@ class AgentConfig:
             raise InvalidInput("drive", "give exactly one of --drive, --source and --rig")
         if self.live.source is not None and self.pace is not PaceKind.REALTIME:
             raise InvalidInput("pace", f"{self.pace}: a live camera does not wait, use realtime")
-        if self.rig is not None and self.steering.mask is not None:
+        if self.rig is not None and self.masking.mask is not None:
             raise InvalidInput("mask", "the masks of a rig stand in its file")
         check_name("camera", self.camera)
         check_name("vehicle", self.vehicle)

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from cav_agent.frames import Capture
 from rfcore.camera import Intrinsics, Pose
-from rfcore.codec.sender.steering import SteeringSettings
+from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.dataset.rig import Rig, RigInstant
 from rfcore.views import PosedPicture
 
@@ -33,7 +33,7 @@ class VehicleCamera:
 
     camera_id: str
     intrinsics: Intrinsics
-    steering: SteeringSettings
+    masking: MaskSettings
     camera_from_rig: Pose | None = None
     priority: float = 1.0
 
@@ -69,11 +69,9 @@ class CameraPictures(Protocol):
 class OneCamera:
     """A vehicle with one camera."""
 
-    def __init__(
-        self, camera_id: str, pictures: CameraPictures, steering: SteeringSettings
-    ) -> None:
+    def __init__(self, camera_id: str, pictures: CameraPictures, masking: MaskSettings) -> None:
         self._pictures = pictures
-        self.cameras = (VehicleCamera(camera_id, pictures.intrinsics, steering),)
+        self.cameras = (VehicleCamera(camera_id, pictures.intrinsics, masking),)
 
     def __len__(self) -> int:
         """Return how many places there are on the drive."""
@@ -118,7 +116,7 @@ class RecordedRig:
             VehicleCamera(
                 camera.name,
                 first[camera.name].camera.intrinsics,
-                SteeringSettings(camera.mask),
+                MaskSettings(camera.mask),
                 camera.camera_from_rig,
                 camera.priority,
             )

@@ -35,8 +35,8 @@ from cav_agent.lights import TileLights
 from cav_agent.server_connection import ServerConnection
 from rfcore.camera import TileOrigin
 from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.sender.ladder import MeasuredRung, Rung, read_ladder
-from rfcore.codec.sender.steering import Steering
 from rfcore.dataset import read_dataset
 from rfcore.dataset.rig import read_rig, read_rig_drive
 from rfcore.errors import FieldFormatError, InvalidInput, RfedgeError, UnknownField
@@ -71,7 +71,7 @@ class PreparedCamera:
 
     camera: VehicleCamera
     codec: CodecConfig
-    steering: Steering
+    qp_map: QpMap | None
 
 
 @dataclass(frozen=True)
@@ -286,7 +286,7 @@ class FieldCache:
         config = self._config
         if config.rig is None:
             pictures = RecordedPictures(read_drive(config, origin))
-            return OneCamera(config.camera, pictures, config.steering)
+            return OneCamera(config.camera, pictures, config.masking)
         rig = read_rig(config.rig)
         return RecordedRig(rig, read_rig_drive(rig, origin), self._instants)
 
@@ -354,8 +354,8 @@ def _check_origin(light: RadianceField, own: RadianceField) -> None:
 def _prepared_camera(config: AgentConfig, camera: VehicleCamera) -> PreparedCamera:
     k = camera.intrinsics
     codec = CodecConfig(k.width_px, k.height_px, config.coding.name, config.crf)
-    settings = replace(camera.steering, mask_qp=config.steering.mask_qp)
-    return PreparedCamera(camera, codec, settings.steering(codec.size_px))
+    settings = replace(camera.masking, mask_qp=config.masking.mask_qp)
+    return PreparedCamera(camera, codec, settings.qp_map(codec.size_px))
 
 
 def read_drive(config: AgentConfig, origin: TileOrigin) -> tuple[PosedPicture, ...]:

@@ -19,11 +19,11 @@ from cav_agent.rig_poses import RigPoses, TrackedRig
 from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
 from rfcore.codec.h264.config import CodecConfig, LightChange
 from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
 from rfcore.codec.sender.ladder import Rung
 from rfcore.codec.sender.rate import RateModel, RateTarget
-from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.codec.state import KEPT_FRAMES, EncoderState, Past
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, Renderer, render_field_view
@@ -81,7 +81,7 @@ class PipelineOptions:
     """A larger slice is coded again at a higher CRF, as long as there is one."""
     rungs: Rungs | None = None
     """Says on which rung each frame is coded; ``None``: the effort, with every reference."""
-    steering: Steering = NO_STEERING
+    qp_map: QpMap | None = None
     """Applies to every frame."""
     feed: CameraPoses | None = None
     """Says where the camera is; ``None``: the drive's own poses."""
@@ -247,7 +247,7 @@ class Pipeline:
             block_means=not job.exact,
             limit_bytes=limit_bytes,
             effort=rung.effort,
-            qp_map=self._options.steering.qp_map,
+            qp_map=self._options.qp_map,
             target=None if budget is None else RateTarget(budget.target_bytes, self._rate),
         )
 

@@ -129,7 +129,7 @@ class Vehicle:
         live = self._live = await self._open_source(stack, observer)
         pictures: VehiclePictures | None = live if isinstance(live, LiveRig) else None
         if isinstance(live, LiveCamera):
-            pictures = OneCamera(config.camera, live.pictures, config.steering)
+            pictures = OneCamera(config.camera, live.pictures, config.masking)
         fields = FieldCache(config, self._servers, observer, pictures)
         stack.push_async_callback(fields.close)
         feed = await self._open_feed(stack, observer)
@@ -318,7 +318,7 @@ class StreamFactory:
             check_decode=config.coding.check_decode,
             light=config.coding.light,
             rungs=prepared.rungs,
-            steering=camera.steering,
+            qp_map=camera.qp_map,
             threads=config.render.threads,
             lights=prepared.lights,
             feed=self._poses(field) if is_alone and not config.localise else None,

@@ -14,11 +14,11 @@ from itertools import tee
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig, LightChange
 from rfcore.codec.h264.ffmpeg import H264Decoder
+from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
 from rfcore.codec.sender.frame_costs import FrameCosts
-from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError, DatasetError, InvalidData, PacketRejected
 from rfcore.field import RadianceField, render_field_view
@@ -145,7 +145,7 @@ class CodingSettings:
     effort: str = DEFAULT_EFFORT
     crf: float = 23.0
     """Constant rate factor, 1..51."""
-    steering: Steering = NO_STEERING
+    qp_map: QpMap | None = None
     """Where in the picture frames are coded finer or coarser."""
     check_decode: bool = False
     """As in ``DeltaEncoder``."""
@@ -210,7 +210,7 @@ def _inputs(
     photometric = () if settings.light is LightChange.OFF else None
     choice = FrameChoice(
         limit_bytes=MAX_PAYLOAD_BYTES,
-        qp_map=settings.steering.qp_map,
+        qp_map=settings.qp_map,
         photometric=photometric,
     )
     for picture in dataset.pictures:

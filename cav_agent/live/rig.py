@@ -20,7 +20,7 @@ from cav_agent.live.camera import LiveCamera, TrajectoryPoses, open_camera
 from cav_agent.live.settings import LiveSettings
 from cav_agent.live.source import LiveFrame, SourceObserver
 from rfcore.camera import TileOrigin
-from rfcore.codec.sender.steering import SteeringSettings
+from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.dataset.rig import Rig, RigCamera
 from rfcore.errors import InvalidInput
 
@@ -190,6 +190,6 @@ def open_rig(
 
 
 def _described(camera: RigCamera, live: LiveCamera) -> VehicleCamera:
-    steering, extrinsics = SteeringSettings(camera.mask), camera.camera_from_rig
+    masking, extrinsics = MaskSettings(camera.mask), camera.camera_from_rig
     k = live.pictures.intrinsics
-    return VehicleCamera(camera.name, k, steering, extrinsics, camera.priority)
+    return VehicleCamera(camera.name, k, masking, extrinsics, camera.priority)

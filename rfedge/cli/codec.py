@@ -48,7 +48,7 @@ class Encode:
 
     def run(self) -> None:
         """Code the drive and print its size."""
-        from rfcore.codec.sender.steering import SteeringSettings
+        from rfcore.codec.h264.qp_map import MaskSettings
         from rfcore.dataset import read_dataset
         from rfcore.raster.renderers import renderer_isa
         from rfcore.wire.drive_file import write_drive
@@ -57,13 +57,10 @@ class Encode:
         isa = renderer_isa(self.renderer)
         field = open_field(self.field, threads=self.threads, isa=isa)
         dataset = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
-        asked = SteeringSettings(self.mask, self.mask_qp)
         k = dataset.pictures[0].camera.intrinsics
-        steering = asked.steering((k.width_px, k.height_px))
+        qp_map = MaskSettings(self.mask, self.mask_qp).qp_map((k.width_px, k.height_px))
         coding = self.coding
-        settings = CodingSettings(
-            coding.name, self.crf, steering, coding.check_decode, coding.light
-        )
+        settings = CodingSettings(coding.name, self.crf, qp_map, coding.check_decode, coding.light)
         coded = encode_drive(dataset, field, settings, self._located(field, dataset))
         write_drive(self.out, coded)
         payload_bytes = sum(len(frame.packet.payload) for frame in coded.frames)

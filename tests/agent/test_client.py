@@ -25,7 +25,7 @@ from cav_agent.frames import (
 )
 from cav_agent.rate_control import RateControl
 from cav_agent.session import AgentSession
-from rfcore.codec.sender.steering import SteeringSettings
+from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.errors import CodecError, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.conventions import TILE, VEHICLE
 from rfcore.wire.convert import client_message_from_bytes
@@ -186,7 +186,7 @@ def open_client(
         pictures = tuple(make_capture(index).picture for index in range(4))
         limits = limits or AgentLimits()
         session = AgentSession(hello, limits, rate_control)
-        drive = OneCamera("front", RecordedPictures(pictures), SteeringSettings())
+        drive = OneCamera("front", RecordedPictures(pictures), MaskSettings())
         source = CameraSource(take or drive.take, coder, executor)
         return StreamClient(server, session, source, heard, limits, tile="street")  # type: ignore[arg-type]
 

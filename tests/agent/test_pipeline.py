@@ -16,7 +16,6 @@ from rfcore.codec.h264.config import CodecConfig, LightChange
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.references import Reference
 from rfcore.codec.sender.ladder import Rung
-from rfcore.codec.sender.steering import Steering
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, render_field_view
 from rfcore.image import I420, Rgb
@@ -105,9 +104,9 @@ def test_a_budget_of_bytes_is_aimed_at_and_costs_quality(noisy: Capture) -> None
 
 def test_a_map_reaches_the_encoder(noisy: Capture) -> None:
     config = CodecConfig(32, 16, effort="fast", crf=30)
-    coarser = Steering(QpMap(np.full((1, 2), 12, np.int8)))
+    coarser = QpMap(np.full((1, 2), 12, np.int8))
     plain = Pipeline(Grey(), config, lambda: 0).encode(EncodeJob(noisy, 0, 1))
-    made = Pipeline(Grey(), config, lambda: 0, PipelineOptions(steering=coarser)).encode(
+    made = Pipeline(Grey(), config, lambda: 0, PipelineOptions(qp_map=coarser)).encode(
         EncodeJob(noisy, 0, 1)
     )
     assert len(made.packet.payload) < 0.7 * len(plain.packet.payload)

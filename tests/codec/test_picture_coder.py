@@ -12,7 +12,7 @@ from rfcore.codec.h264 import ffmpeg
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded
-from rfcore.codec.sender.picture_coder import Asked, CodedPicture, picture_coder
+from rfcore.codec.sender.picture_coder import CodedPicture, CodingRequest, picture_coder
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView
@@ -71,8 +71,8 @@ def test_a_coder_that_promises_another_picture_is_found_out(
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX), check_decode=True)
     code = encoder._coder.code
 
-    def wrong(frame: I420, references: list[I420], asked: Asked) -> CodedPicture:
-        made = code(frame, references, asked)
+    def wrong(frame: I420, references: list[I420], request: CodingRequest) -> CodedPicture:
+        made = code(frame, references, request)
         assert made.reconstruction is not None
         y = made.reconstruction.y.copy()
         y[5, 5] ^= 1
@@ -112,4 +112,4 @@ def test_an_effort_of_the_other_coder_is_refused(pair: PairMaker, effort: str, o
     frame, view = pair(*SIZE_PX)
     coder = picture_coder(CodecConfig(*SIZE_PX, effort))
     with pytest.raises(InvalidInput, match=f"'{other}' is none of the stream's coder"):
-        coder.code(frame, [view.render], Asked(23, other))
+        coder.code(frame, [view.render], CodingRequest(23, other))

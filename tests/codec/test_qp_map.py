@@ -1,6 +1,7 @@
 """Finer where a mask says so: the map's laws, and what x264 and the receiver make of it."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +12,11 @@ from numpy.typing import NDArray
 
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.qp_map import QpMap, qp_map_of_mask
+from rfcore.codec.h264.qp_map import MaskSettings, QpMap, qp_map_of_mask
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
-from rfcore.errors import InvalidInput
-from rfcore.image import I420
+from rfcore.errors import DatasetError, InvalidInput
+from rfcore.image import I420, write_png
 from rfcore.views import FieldView
 
 PairMaker = Callable[..., tuple[I420, FieldView]]
@@ -132,3 +133,28 @@ def test_maps_that_cannot_be_are_refused(pair: PairMaker) -> None:
     choice = FrameChoice(qp_map=QpMap(np.zeros((2, 2), np.int8)))
     with pytest.raises(InvalidInput, match=r"qp_map: shape \(2, 2\) where the stream has"):
         code(encoder, pair(*SIZE_PX), choice)
+
+
+@pytest.fixture
+def mask(tmp_path: Path) -> Path:
+    pixels = np.zeros((48, 64, 3), np.uint8)
+    pixels[16:32, 32:64] = 255
+    write_png(tmp_path / "mask.png", pixels)
+    return tmp_path / "mask.png"
+
+
+def test_what_is_white_in_a_masks_file_is_coded_finer(mask: Path) -> None:
+    qp_map = MaskSettings(mask, mask_qp=-8).qp_map((64, 48))
+    assert qp_map is not None
+    assert qp_map.offsets.tolist() == [[0] * 4, [0, 0, -8, -8], [0] * 4]
+    assert MaskSettings().qp_map((64, 48)) is None
+
+
+def test_a_mask_that_does_not_fit_is_refused(mask: Path, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="has 64x48 px, the camera 640x360 px"):
+        MaskSettings(mask).qp_map((640, 360))
+    with pytest.raises(InvalidInput, match="-40 and 0 must be within"):
+        MaskSettings(mask, mask_qp=-40).qp_map((64, 48))
+    (tmp_path / "text.png").write_text("no picture")
+    with pytest.raises(DatasetError, match="not a readable picture"):
+        MaskSettings(tmp_path / "text.png").qp_map((64, 48))

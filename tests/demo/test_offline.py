@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.codec.sender.encoder import DeltaEncoder
-from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.dataset import Dataset, read_dataset
 from rfcore.errors import InvalidData
 from rfcore.field import SplatField, render_field_view
@@ -54,8 +54,8 @@ def test_a_drive_coded_with_a_mask_decodes(
     mask = np.zeros((64, 96, 3), np.uint8)
     mask[:32] = 255
     write_png(tmp_path / "mask.png", mask)
-    asked = SteeringSettings(tmp_path / "mask.png", -8)
-    settings = replace(SETTINGS, steering=asked.steering((96, 64)))
+    asked = MaskSettings(tmp_path / "mask.png", -8)
+    settings = replace(SETTINGS, qp_map=asked.qp_map((96, 64)))
     plain, coded = (encode_drive(drive, field, how) for how in (SETTINGS, settings))
     bits = [sum(len(frame.packet.payload) for frame in made.frames) for made in (plain, coded)]
     assert bits[1] > bits[0]

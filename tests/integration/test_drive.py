@@ -14,7 +14,7 @@ from cav_agent.config import PaceKind
 from forward_isas import OPENCL
 from recorded import recorded, recorded_parts
 from rfcore.codec.h264.config import CoderSettings, LightChange
-from rfcore.codec.sender.steering import SteeringSettings
+from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable
 from rfcore.image import I420, read_rgb, write_png
@@ -204,9 +204,9 @@ async def test_a_drive_with_a_mask_is_reconstructed(
     serve: Any, travel: Any, tmp_path: Path
 ) -> None:
     write_png(tmp_path / "mask.png", np.full((52, 76, 3), 255, np.uint8))
-    steering = SteeringSettings(tmp_path / "mask.png", -3)
+    masking = MaskSettings(tmp_path / "mask.png", -3)
     async with serve() as server:
-        record = await travel(server.address, steering=steering)
+        record = await travel(server.address, masking=masking)
     assert record.counts == {"acked": 6}
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,17 @@ from numpy.typing import NDArray
 
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.errors import InvalidInput
+from rfcore.image import read_rgb
 
-__all__ = ["MB_PX", "QP_OFFSET_RANGE", "QpMap", "Region", "check_qp_map", "qp_map_of_mask"]
+__all__ = [
+    "MB_PX",
+    "QP_OFFSET_RANGE",
+    "MaskSettings",
+    "QpMap",
+    "Region",
+    "check_qp_map",
+    "qp_map_of_mask",
+]
 
 MB_PX = 16
 QP_OFFSET_RANGE = (-24, 24)
@@ -96,6 +106,33 @@ def qp_map_of_mask(
         raise InvalidInput("qp_offset", f"{qp_offset} and {rest} must be within {low}..{high}")
     inside = mask != 0 if mask.shape == shape else macroblock_means(mask != 0) >= COVERED
     return QpMap(np.where(inside, qp_offset, rest).astype(np.int8))
+
+
+BRIGHT = 128
+"""A pixel of a mask's file is in the mask if one of its channels is at least this."""
+
+
+@dataclass(frozen=True)
+class MaskSettings:
+    """A mask whose macroblocks are coded finer or coarser, as options of a command line."""
+
+    mask: Path | None = None
+    """Picture of the camera's size, white where frames are to be coded finer."""
+    mask_qp: int = -6
+    """Added to H.264's quantiser in the mask, -24..24; -6 halves its step."""
+
+    def qp_map(self, size_px: tuple[int, int]) -> QpMap | None:
+        """Return the map for frames of ``size_px``; raise ``InvalidInput`` for another size."""
+        if self.mask is None:
+            return None
+        bright = read_rgb(self.mask).max(axis=2) >= BRIGHT
+        if bright.shape != size_px[::-1]:
+            raise InvalidInput(
+                "mask",
+                f"{self.mask} has {bright.shape[1]}x{bright.shape[0]} px, the camera "
+                f"{size_px[0]}x{size_px[1]} px",
+            )
+        return qp_map_of_mask(bright, size_px, self.mask_qp)
 
 
 def check_qp_map(qp_map: QpMap, config: CodecConfig) -> None:

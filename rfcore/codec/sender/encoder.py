@@ -34,7 +34,7 @@ from rfcore.codec.references import (
     is_temporal,
 )
 from rfcore.codec.sender.frame_costs import FrameCosts
-from rfcore.codec.sender.picture_coder import Asked, CodedPicture, picture_coder
+from rfcore.codec.sender.picture_coder import CodedPicture, CodingRequest, picture_coder
 from rfcore.codec.sender.rate import FittedSlice, RateModel, RateTarget, bits_curve, code_to_fit
 from rfcore.codec.sender.reference_choice import (
     choose_photometric,
@@ -326,8 +326,8 @@ class DeltaEncoder:
     def _slice(
         self, pictures: tuple[I420, ...], frame: I420, choice: FrameChoice, crf: float
     ) -> CodedPicture:
-        asked = Asked(crf, choice.effort or self._config.effort, choice.qp_map)
-        return self._coder.code(frame, pictures, asked)
+        request = CodingRequest(crf, choice.effort or self._config.effort, choice.qp_map)
+        return self._coder.code(frame, pictures, request)
 
     def _reconstruction(self, pictures: tuple[I420, ...], coded: CodedPicture) -> I420:
         """Return the receiver's picture; decode only if the coder does not know it."""

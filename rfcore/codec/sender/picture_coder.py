@@ -22,7 +22,7 @@ from rfcore.codec.h264.splice import grey
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
-__all__ = ["QP_OF_CRF", "Asked", "CodedPicture", "PictureCoder", "picture_coder"]
+__all__ = ["QP_OF_CRF", "CodedPicture", "CodingRequest", "PictureCoder", "picture_coder"]
 
 QP_OF_CRF = 6.5
 """Median of the QP at which our coder's squared error is x264's, less the CRF: 6.2 on the empty
@@ -30,7 +30,7 @@ sample drive, 6.8 on the one with vehicles, from CRF 15 to 40."""
 
 
 @dataclass(frozen=True)
-class Asked:
+class CodingRequest:
     """The settings of one picture; ``effort`` is one of the stream's coder."""
 
     crf: float
@@ -53,7 +53,7 @@ class PictureCoder(Protocol):
     def header(self) -> StreamHeader:
         """The parameter sets of every slice."""
 
-    def code(self, frame: I420, references: Sequence[I420], asked: Asked) -> CodedPicture:
+    def code(self, frame: I420, references: Sequence[I420], request: CodingRequest) -> CodedPicture:
         """Code ``frame`` against ``references``, the last one reference 0.
 
         Raises ``InvalidInput`` for an effort of another coder, ``CodecError`` if x264 fails.
@@ -72,14 +72,14 @@ class _OwnPictureCoder:
         self.header = own_header(config)
         self._coder = SliceCoder(self.header, threads=threads)
 
-    def code(self, frame: I420, references: Sequence[I420], asked: Asked) -> CodedPicture:
-        _require_coder(asked.effort, Coder.OWN)
+    def code(self, frame: I420, references: Sequence[I420], request: CodingRequest) -> CodedPicture:
+        _require_coder(request.effort, Coder.OWN)
         coded = self._coder.encode(
             frame,
             references,
-            asked.crf + QP_OF_CRF,
-            effort=Effort[asked.effort.upper()],
-            offsets=None if asked.qp_map is None else asked.qp_map.offsets.ravel(),
+            request.crf + QP_OF_CRF,
+            effort=Effort[request.effort.upper()],
+            offsets=None if request.qp_map is None else request.qp_map.offsets.ravel(),
         )
         return CodedPicture(coded.payload, coded.reconstruction)
 
@@ -90,10 +90,10 @@ class _X264PictureCoder:
         self._threads = threads
         self.header = encode_slice(config, [grey(config)], grey(config)).header
 
-    def code(self, frame: I420, references: Sequence[I420], asked: Asked) -> CodedPicture:
-        _require_coder(asked.effort, Coder.X264)
-        config = replace(self._config, effort=asked.effort)
-        coding = SliceCoding(asked.crf, asked.qp_map, threads=self._threads)
+    def code(self, frame: I420, references: Sequence[I420], request: CodingRequest) -> CodedPicture:
+        _require_coder(request.effort, Coder.X264)
+        config = replace(self._config, effort=request.effort)
+        coding = SliceCoding(request.crf, request.qp_map, threads=self._threads)
         coded = encode_slice(config, references, frame, coding)
         if (coded.header.sps, coded.header.pps) != (self.header.sps, self.header.pps):
             raise CodecError("x264 changed its parameter sets within a stream")
