@@ -21,7 +21,7 @@ from cav_agent.metrics import AgentMetrics
 from cav_agent.pose_feed.fix import FeedProblem
 from cav_agent.rate_control import QualitySteps
 from rfcore.field import RadianceField
-from rfcore.localise.fix import Fix, State
+from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.wire.address import Address
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.sensing import ClockKind
@@ -64,7 +64,7 @@ class DriveObserver:
         self._servers = tuple(servers)
         self._frame_log = frame_log
         self._quality_steps = QualitySteps()
-        self._pose_state: State | None = None
+        self._pose_state: LocalisationState | None = None
         self._feed_offset_s: float | None = None
         self._log = log
 
@@ -242,7 +242,7 @@ def _coding_of(result: FrameResult) -> dict[str, Any]:
     }
 
 
-def _pose_of(fix: Fix) -> dict[str, Any]:
+def _pose_of(fix: PoseEstimate) -> dict[str, Any]:
     correction = fix.correction
     return {
         "state": str(fix.state),

@@ -15,7 +15,7 @@ from rfcore.camera import Pose
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.sender.ladder import FULL_RUNG, Rung
 from rfcore.errors import RejectReason
-from rfcore.localise.fix import Fix, State
+from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.views import PosedPicture
 from rfcore.wire.messages import FrameAddress, StageTimes
 from rfcore.wire.sensing import ClockKind
@@ -82,7 +82,7 @@ class RigPose:
     """
 
     world_from_rig: Pose | None
-    state: State | None = None
+    state: LocalisationState | None = None
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class EncodedFrame:
     crf: float | None = None
     pose: Pose | None = None
     read_s: float = 0.0
-    fix: Fix | None = None
+    fix: PoseEstimate | None = None
     waited_s: float = 0.0
     field_id: str = ""
     world_from_rig: RigPose | None = None

@@ -15,7 +15,7 @@ from cav_agent.handover import HandoverCause
 from cav_agent.live.source import SourceProblem
 from cav_agent.pose_feed.fix import FeedProblem
 from rfcore.codec.references import references_name
-from rfcore.localise.fix import Fix, State
+from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.wire.instruments import Instruments
 from rfcore.wire.notices import NOTICE_KINDS, StreetNotice
 from rfcore.wire.sensing import ClockKind
@@ -80,7 +80,7 @@ class AgentMetrics:
         self._poses = make.counter(
             "rfedge_agent_pose_frames", "Coded frames by what was known of their pose.", ("state",)
         )
-        for state in State:
+        for state in LocalisationState:
             self._poses.labels(state)
         self._inliers = make.gauge(
             "rfedge_agent_pose_inliers", "Feature matches that agreed with the last pose searched."
@@ -270,13 +270,13 @@ class AgentMetrics:
         if encoded.fix is not None:
             self._fixed(encoded.fix)
 
-    def _fixed(self, fix: Fix) -> None:
-        for state in State:
+    def _fixed(self, fix: PoseEstimate) -> None:
+        for state in LocalisationState:
             self._pose_state.labels(state).set(state is fix.state)
         self._poses.labels(fix.state).inc()
         if fix.inliers is not None:
             self._inliers.set(fix.inliers)
-        if fix.state is State.TRACKING:
+        if fix.state is LocalisationState.TRACKING:
             self._agreement.set(fix.agreement)
         if fix.correction is not None:
             self._correction.set(fix.correction.metres)

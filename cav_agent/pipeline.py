@@ -28,7 +28,7 @@ from rfcore.codec.state import KEPT_FRAMES, EncoderState, Past
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, Renderer, render_field_view
 from rfcore.image import I420, Rgb
-from rfcore.localise.fix import Fix
+from rfcore.localise.estimate import PoseEstimate
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
@@ -48,7 +48,7 @@ class CameraPoses(Protocol):
 class Tracking(Protocol):
     """Finds the camera in the field (``cav_agent.tracking``)."""
 
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> PoseEstimate:
         """Return what is known of a picture's pose."""
 
 
@@ -69,7 +69,7 @@ class Placed:
     """What the field shows where a picture was taken; ``view`` ``None``: its camera is lost."""
 
     view: FieldView | None
-    fix: Fix | None = None
+    fix: PoseEstimate | None = None
     world_from_rig: RigPose | None = None
 
 

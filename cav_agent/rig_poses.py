@@ -13,7 +13,7 @@ from cav_agent.frames import Capture, RigPose
 from rfcore.camera import Camera, Pose
 from rfcore.codec.sender.ladder import Rung
 from rfcore.image import I420
-from rfcore.localise.fix import Fix, State
+from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.motion import quaternion_from_vector, rotation_vector
 
 __all__ = ["DrivenRig", "MeasuredRig", "ReferenceTracking", "RigPoses", "TrackedRig"]
@@ -44,7 +44,7 @@ class ReferencePoses(Protocol):
 class ReferenceTracking(Protocol):
     """Finds the reference camera in the field (``cav_agent.tracking``)."""
 
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> PoseEstimate:
         """Return what is known of a picture's pose."""
 
 
@@ -80,9 +80,9 @@ class TrackedRig:
         self._last: tuple[int, Pose] | None = None
         self._before: tuple[int, Pose] | None = None
         self._heard_ns: int | None = None
-        self._state: State | None = None
+        self._state: LocalisationState | None = None
 
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> PoseEstimate:
         """Look for the rig in the picture of its reference camera."""
         fix = self._tracking.locate(capture, frame, rung)
         self._heard_ns, self._state = capture.capture_time_ns, fix.state

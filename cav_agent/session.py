@@ -37,7 +37,7 @@ from cav_agent.rate_control import ByteBudget, RateControl
 from cav_agent.waiting_instants import WaitingInstants
 from rfcore.camera import Pose
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
-from rfcore.localise.fix import State
+from rfcore.localise.estimate import LocalisationState
 from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, MAX_PAYLOAD_BYTES
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import (
@@ -461,7 +461,7 @@ def _restart_after(nack: Nack, chain: PredictionChain) -> None:
     chain.restart(nack.current_epoch)
 
 
-def _localisation(encoded: EncodedFrame) -> State | None:
+def _localisation(encoded: EncodedFrame) -> LocalisationState | None:
     """Return how the frame's pose was found in the field, in its own picture or the reference's."""
     found = encoded.fix or encoded.world_from_rig
     return None if found is None else found.state

@@ -19,17 +19,17 @@ from rfcore.camera import Intrinsics, Vec3
 from rfcore.codec.sender.ladder import Rung
 from rfcore.field import Bounds, Renderer
 from rfcore.image import I420
-from rfcore.localise.fix import Fix
+from rfcore.localise.estimate import PoseEstimate
 from rfcore.localise.localiser import Localised, Localiser, Lost
 from rfcore.localise.matching import use_one_thread
-from rfcore.localise.measurement import PoseMeasurement
-from rfcore.localise.track import Effort
-from rfcore.localise.tracker import PoseTracker, SearchJob, Seen, full_range
+from rfcore.localise.prior import PoseMeasurement
+from rfcore.localise.track import TrackingBudget
+from rfcore.localise.tracker import PoseTracker, SearchJob, TimedPose, full_range
 
 __all__ = ["CameraTracking", "DatasetPoses", "Measurements"]
 
 U8 = NDArray[np.uint8]
-_Found = tuple[Localised | Lost, Seen | None]
+_Found = tuple[Localised | Lost, TimedPose | None]
 """What a search ended with, and where a later picture was taken, if that was looked for."""
 DATASET_STD_M, DATASET_STD_DEG = 0.5, 1.0
 """Poses of a dataset stand in for a sensor's as good as that."""
@@ -101,21 +101,21 @@ class CameraTracking:
         self._running: tuple[SearchJob, Future[_Found]] | None = None
         self._newest: tuple[int, U8] | None = None
 
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> PoseEstimate:
         """Return what is known of a picture's pose, looked for as hard as ``rung`` says."""
-        effort = Effort(rung.tracking.redraws, rung.tracking.finest_level)
+        budget = TrackingBudget(rung.tracking.redraws, rung.tracking.finest_level)
         time_ns = self._poses.time_ns(capture)
         self._tracker.expect(time_ns)
         for measured in self._poses.measurements(capture):
             self._tracker.measure(measured)
         self._collect()
         self._newest = None if self._running is None else (time_ns, full_range(frame.y))
-        fix = self._tracker.locate(frame, time_ns, quality=rung.quality, effort=effort)
+        fix = self._tracker.locate(frame, time_ns, quality=rung.quality, budget=budget)
         self._begin_search()
         if self._patient and self._running is not None:
             self._running[1].exception()
             self._collect()
-            fix = self._tracker.locate(frame, time_ns, quality=rung.quality, effort=effort)
+            fix = self._tracker.locate(frame, time_ns, quality=rung.quality, budget=budget)
         if fix.world_from_cam is not None:
             self._poses.localised(time_ns, fix.world_from_cam.translation_m)
         return replace(fix, feed_offset_s=self._poses.offset_s())

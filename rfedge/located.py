@@ -15,8 +15,8 @@ from itertools import pairwise
 from rfcore.camera import Pose
 from rfcore.field import RadianceField
 from rfcore.image import I420
-from rfcore.localise.fix import Fix
-from rfcore.localise.measurement import PoseMeasurement
+from rfcore.localise.estimate import PoseEstimate
+from rfcore.localise.prior import PoseMeasurement
 from rfcore.localise.tracker import PoseTracker
 from rfcore.views import FieldView, PosedPicture
 
@@ -50,7 +50,7 @@ class TimedFix:
     ``search_cpu_ms`` is 0 where no search was run.
     """
 
-    fix: Fix
+    fix: PoseEstimate
     track_cpu_ms: float
     search_cpu_ms: float
 

@@ -23,7 +23,7 @@ from rfcore.dataset.recording import RecordedPoses, RecordingCamera, read_record
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.errors import DatasetError, InvalidInput, RfedgeError
 from rfcore.image import Rgb
-from rfcore.localise.measurement import PoseMeasurement
+from rfcore.localise.prior import PoseMeasurement
 from rfcore.views import PosedPicture
 
 __all__ = ["LiveCamera", "LivePictures", "LiveSchedule", "TrajectoryPoses", "open_camera"]

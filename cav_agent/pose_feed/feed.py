@@ -34,7 +34,7 @@ from cav_agent.pose_feed.placing import Place
 from rfcore.camera import Vec3
 from rfcore.errors import InvalidInput
 from rfcore.field import Bounds
-from rfcore.localise.measurement import PoseMeasurement
+from rfcore.localise.prior import PoseMeasurement
 
 __all__ = ["FeedReader", "FieldFeed", "PoseFeed", "TimeOffset", "TimeOffsetEstimator"]
 

@@ -13,8 +13,7 @@ from cav_agent.pose_feed.checks import FASTEST_MPS, NS
 from cav_agent.pose_feed.feed import FieldFeed
 from rfcore.camera import Camera, Pose, Vec3
 from rfcore.errors import RfedgeError
-from rfcore.localise.measurement import PoseMeasurement
-from rfcore.localise.prior import PosePrior
+from rfcore.localise.prior import PoseMeasurement, PosePrior
 
 __all__ = ["FollowedFeed"]
 

@@ -13,7 +13,7 @@ from cav_agent.pose_feed.fix import Fix
 from rfcore.camera import Pose, TileOrigin, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.geodesy import Anchor
-from rfcore.localise.measurement import PoseMeasurement
+from rfcore.localise.prior import PoseMeasurement
 from rfcore.motion import quaternion_from_vector
 
 __all__ = ["CameraMount", "Place"]

@@ -22,7 +22,7 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, render_field_view
-from rfcore.localise.fix import State
+from rfcore.localise.estimate import LocalisationState
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
 from rfedge.evaluate.clips import luma_mse, psnr_of_mse
@@ -102,7 +102,7 @@ def _row(
         text,
         found.percent_more(own),
         float(np.mean(found.psnr_db)),
-        100 * float(np.mean([fix.fix.state is State.TRACKING for fix in fixes])),
+        100 * float(np.mean([fix.fix.state is LocalisationState.TRACKING for fix in fixes])),
         float(np.median(searches)) if searches else None,
         _track_cpu_ms(fixes),
         render_cpu_ms,

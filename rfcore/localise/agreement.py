@@ -1,4 +1,4 @@
-"""Whether a picture resembles a render on the spot, against what chance would make of it.
+"""Compare a picture with a render at the same pose, against the resemblance of chance.
 
 Both are reduced to local structure (blur taken away, divided by local contrast), so that exposure
 and slow changes of light do not count. Chance is the same render displaced. ``agreement`` looks at

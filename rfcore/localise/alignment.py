@@ -69,7 +69,7 @@ TINY = np.float32(1e-6)
 
 @dataclass(frozen=True)
 class Expected:
-    """How far a motion is expected to be from where alignment begins: one sigma."""
+    """Expected distance of a motion from where alignment begins: one sigma."""
 
     metres: float
     radians: float
@@ -143,7 +143,7 @@ class _Scale:
 
 @dataclass(frozen=True)
 class _Prior:
-    """Where the motion is expected, and how far from there."""
+    """The expected motion, and how far from it the true one may be."""
 
     start: Pose
     expected: Expected

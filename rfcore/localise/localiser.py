@@ -31,10 +31,18 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, Renderer, render_field_view
 from rfcore.localise.agreement import agreement, eight_bits
-from rfcore.localise.matching import Features, Solution, features, grey, lifted, matched, solved
+from rfcore.localise.matching import (
+    Features,
+    PnpSolution,
+    find_features,
+    grey,
+    lift_matches,
+    match_features,
+    solve_pose,
+)
 from rfcore.localise.prior import PosePrior, hypotheses
 from rfcore.localise.structure import Pyramid
-from rfcore.localise.track import Track, TrackSettings, begun
+from rfcore.localise.track import Track, begin_track
 from rfcore.views import FieldView, View
 
 __all__ = [
@@ -59,7 +67,7 @@ LEAST_HALVED_PX = 90
 
 @dataclass(frozen=True)
 class LocaliserSettings:
-    """When a match counts and when a pose is believed.
+    """Thresholds of the search: which matches count, and which poses are believed.
 
     Raises ``InvalidInput`` for a value that is not above 0.
     """
@@ -94,7 +102,7 @@ class LocaliserSettings:
 
 
 class Obstacle(IntEnum):
-    """What kept a hypothesis from leading to a pose, in the order of the checks."""
+    """The check that a hypothesis failed, in the order of the checks."""
 
     FEW_FEATURES = 1
     """The picture has too few features: dark, or out of focus."""
@@ -114,7 +122,7 @@ class Localised:
     ``hypotheses`` were tried.
     """
 
-    solution: Solution
+    solution: PnpSolution
     agreement: float
     hypotheses: int
 
@@ -126,7 +134,7 @@ class Localised:
 
 @dataclass(frozen=True)
 class Lost:
-    """No pose: what stopped the hypothesis that got furthest, and how many were tried."""
+    """No pose was found: the check that the best hypothesis failed, and how many were tried."""
 
     obstacle: Obstacle
     hypotheses: int
@@ -216,12 +224,12 @@ class Localiser:
         """Return a picture's features; None where they, or the halved picture, are too few."""
         if halvings and min(luma.shape) < 2 * LEAST_HALVED_PX:
             return None
-        seen = features(luma, self._settings.features, halvings)
+        seen = find_features(luma, self._settings.features, halvings)
         return seen if len(seen.uv_px) >= self._settings.least_inliers else None
 
     def _tried(
         self, luma: U8, prior: PosePrior, seen: Features, start: Pose, view: View
-    ) -> tuple[Solution, float] | Obstacle:
+    ) -> tuple[PnpSolution, float] | Obstacle:
         """Return the pose that a hypothesis leads to and its agreement, or what kept it from it."""
         solution = self._solution(seen, start, view, self._settings.rounds)
         if solution is None:
@@ -238,22 +246,22 @@ class Localiser:
         for pose in poses:
             yield pose, self._render(pose)
 
-    def _solution(self, seen: Features, start: Pose, view: View, rounds: int) -> Solution | None:
+    def _solution(self, seen: Features, start: Pose, view: View, rounds: int) -> PnpSolution | None:
         """Return the pose that enough matches agree with, after so many rounds, or None."""
         s, k = self._settings, self._intrinsics
         solution = None
         for number in range(rounds):
             if solution is not None:
                 start, view = solution.world_from_cam, self._render(solution.world_from_cam)
-            drawn = features(grey(eight_bits(view.colour)), s.features, seen.halvings)
-            found = lifted(matched(seen, drawn, s.ratio), view, k, s.least_confidence)
-            solution = solved(found, k, start, s.inlier_px if number else s.first_inlier_px)
+            drawn = find_features(grey(eight_bits(view.colour)), s.features, seen.halvings)
+            found = lift_matches(match_features(seen, drawn, s.ratio), view, k, s.least_confidence)
+            solution = solve_pose(found, k, start, s.inlier_px if number else s.first_inlier_px)
             least = s.least_inliers if number else s.least_first_inliers
             if solution is None or solution.inliers < least:
                 return None
         return solution
 
-    def _agreement(self, luma: U8, solution: Solution) -> tuple[Solution, float] | None:
+    def _agreement(self, luma: U8, solution: PnpSolution) -> tuple[PnpSolution, float] | None:
         """Return the solution aligned photometrically, and its agreement; None if refuted."""
         track = self._settled(Pyramid(luma), solution.world_from_cam)
         if track is None:
@@ -271,8 +279,8 @@ class Localiser:
                 self._renderer, Camera(self._intrinsics, pose).rounded(), self._quality
             )
 
-        settings = TrackSettings(least_on_the_spot=self._settings.least_on_the_spot)
-        return begun(0, near, None, levels, render_at, settings, MOST_ALIGNMENTS)
+        share = self._settings.least_on_the_spot
+        return begin_track(0, near, None, levels, render_at, MOST_ALIGNMENTS, share)
 
     def _render(self, world_from_cam: Pose) -> View:
         return self._renderer.render(Camera(self._intrinsics, world_from_cam), self._quality)

@@ -26,12 +26,12 @@ with needs("localise"):
 __all__ = [
     "Features",
     "Matches",
-    "Solution",
-    "features",
+    "PnpSolution",
+    "find_features",
     "grey",
-    "lifted",
-    "matched",
-    "solved",
+    "lift_matches",
+    "match_features",
+    "solve_pose",
     "use_one_thread",
 ]
 
@@ -47,9 +47,9 @@ FEWEST_FOR_PNP = 6
 
 @dataclass(frozen=True)
 class Features:
-    """Where something is, ``uv_px`` float64 [N, 2], and what: ``descriptors`` float32 [N, 128].
+    """Places ``uv_px`` float64 [N, 2] of features, and ``descriptors`` float32 [N, 128] of them.
 
-    Places are those of the whole picture, which was halved so many times before it was looked at.
+    Places are those of the whole picture, which was halved ``halvings`` times before the search.
     """
 
     uv_px: F64
@@ -66,7 +66,7 @@ class Matches:
 
 
 @dataclass(frozen=True)
-class Solution:
+class PnpSolution:
     """A camera's pose; so many matches agree with it, to ``rms_px`` pixels."""
 
     world_from_cam: Pose
@@ -84,7 +84,7 @@ def grey(rgb: U8) -> U8:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def features(luma: U8, most: int, halvings: int = 0) -> Features:
+def find_features(luma: U8, most: int, halvings: int = 0) -> Features:
     """Return at most ``most`` features of a picture uint8 [H, W], the strongest.
 
     ``halvings``: of the picture's resolution before; each takes three quarters of the time away.
@@ -99,7 +99,7 @@ def features(luma: U8, most: int, halvings: int = 0) -> Features:
     return Features(uv_px, np.asarray(descriptors, np.float32), halvings)
 
 
-def matched(seen: Features, drawn: Features, ratio: float) -> tuple[F64, F64]:
+def match_features(seen: Features, drawn: Features, ratio: float) -> tuple[F64, F64]:
     """Return places [N, 2] in the picture and those in the render that look the same.
 
     A match is kept if its distance is below ``ratio`` of that to the second nearest feature.
@@ -114,7 +114,7 @@ def matched(seen: Features, drawn: Features, ratio: float) -> tuple[F64, F64]:
     )
 
 
-def lifted(
+def lift_matches(
     pairs: tuple[F64, F64], view: View, intrinsics: Intrinsics, least_confidence: float
 ) -> Matches:
     """Return matches with the points of the render in its camera's axes, by the rendered depth.
@@ -152,9 +152,9 @@ def _depth_at(depth_m: F32, uv_px: F64) -> F64:
     return np.where(hit, 1.0 / inverse, 0.0)
 
 
-def solved(
+def solve_pose(
     matches: Matches, intrinsics: Intrinsics, drawn_at: Pose, inlier_px: float
-) -> Solution | None:
+) -> PnpSolution | None:
     """Return the pose that most matches agree with to ``inlier_px``, or None if there is none.
 
     ``drawn_at`` is world_from_cam of the render. OpenCV's RANSAC starts from a fixed seed: the same
@@ -187,7 +187,7 @@ def solved(
     again_px = cv2.projectPoints(xyz_m, turn, shift, k, None)[0][:, 0]
     rms_px = float(np.sqrt(np.mean(np.sum((again_px - uv_px) ** 2, axis=1))))
     cam_from_drawn = Pose.from_matrix(np.hstack([cv2.Rodrigues(turn)[0], shift]).tolist())
-    return Solution(drawn_at.compose(cam_from_drawn.inverse()), len(inliers), rms_px)
+    return PnpSolution(drawn_at.compose(cam_from_drawn.inverse()), len(inliers), rms_px)
 
 
 def _camera_matrix(intrinsics: Intrinsics) -> F64:

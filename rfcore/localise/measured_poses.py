@@ -1,16 +1,16 @@
-"""What a feed has said so far: the newest measurement, the sensor's bias, and where to search.
+"""Measurements of a feed so far: the newest one, the sensor's bias, and where to search.
 
 Times may run backwards, poses may jump or lie outside the field: each is counted, none is followed
 blindly. A jump is believed when it is repeated.
 
 The slowly varying error of measured poses is learnt while tracking and taken away while lost. A
 sensor's position is the true one plus a bias that changes slowly (a lever arm measured wrongly,
-the atmosphere, multipath) plus noise. While the camera is tracked the truth is known far better
+the atmosphere, multipath) plus noise. While the camera is tracked, its pose is known far better
 than the sensor knows it, so each measurement shows bias plus noise; a Kalman filter for a random
 walk, one for each axis of the world and one for each axis of the camera's rotation, keeps the bias.
-A constant error is paid for once: after it was learnt, priors lie around the corrected pose.
+Once a constant error was learnt, priors lie around the corrected pose.
 
-Values: ``after`` returns the next; nothing here has a clock.
+``SensorBias`` is a value: ``after`` returns the next one. Nothing here has a clock.
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Pose
 from rfcore.field import Bounds
-from rfcore.localise.fix import Correction, Event
-from rfcore.localise.measurement import PoseMeasurement
-from rfcore.localise.prior import PosePrior
+from rfcore.localise.estimate import MeasurementError, TrackerEvent
+from rfcore.localise.prior import PoseMeasurement, PosePrior
 from rfcore.localise.track import Motion, Track
 from rfcore.motion import quaternion_from_vector, rotation_vector
 
@@ -46,10 +45,11 @@ NOTHING: tuple[float, ...] = (0.0,) * 6
 
 @dataclass(frozen=True)
 class SensorBias:
-    """What is known of a sensor: six axes, east, north, up in metres, then a rotation vector.
+    """Error of a sensor along six axes: east, north, up in metres, then a rotation vector.
 
-    ``value`` is the bias, ``variance`` of it; ``noise``: variance of what remains of measurements.
-    Both are in units of the variances that the sensor states. Nothing known: variance 1, noise 1.
+    ``value`` is the bias and ``variance`` that of its estimate; ``noise`` is the variance of what
+    remains of measurements. Both variances are in units of those that the sensor states; 1 stands
+    for nothing known.
     """
 
     value: tuple[float, ...] = NOTHING
@@ -159,7 +159,7 @@ LEAST_M, LEAST_DEG = 0.3, 1.5
 class MeasuredPoses:
     """The feed of one camera; ``counts`` is shared with the tracker."""
 
-    def __init__(self, counts: Counter[Event], bounds: Bounds | None) -> None:
+    def __init__(self, counts: Counter[TrackerEvent], bounds: Bounds | None) -> None:
         self._counts, self._bounds = counts, bounds
         self.newest: PoseMeasurement | None = None
         self.bias = SensorBias()
@@ -169,12 +169,12 @@ class MeasuredPoses:
         """Take in a measurement, and what it shows of the bias while there is a track."""
         last = self.newest
         if last is not None and measured.time_ns <= last.time_ns:
-            self._counts[Event.BACKWARDS] += 1
+            self._counts[TrackerEvent.BACKWARDS] += 1
             return
         if self._is_outside(measured):
-            self._counts[Event.OUTSIDE] += 1
+            self._counts[TrackerEvent.OUTSIDE] += 1
             return
-        self._counts[Event.MEASURED] += 1
+        self._counts[TrackerEvent.MEASURED] += 1
         self.newest = measured
         if track is not None:
             self._learn(measured, track)
@@ -196,7 +196,7 @@ class MeasuredPoses:
             return None
         age_s = (time_ns - measured.time_ns) / 1e9
         if abs(age_s) > OLDEST_S:
-            self._counts[Event.OFF_TIME] += 1
+            self._counts[TrackerEvent.OFF_TIME] += 1
             return None
         prior = self.bias.prior(measured, facing)
         if prior is None:
@@ -209,24 +209,24 @@ class MeasuredPoses:
             widened * max(prior.rotation_deg, LEAST_DEG),
         )
 
-    def correction(self, time_ns: int, found: Pose) -> Correction | None:
+    def correction(self, time_ns: int, found: Pose) -> MeasurementError | None:
         """Return how far a pose is from the newest measurement, if that is of the same time."""
         measured = self.newest
         if measured is None or abs(measured.time_ns - time_ns) > SAME_TIME_NS:
             return None
         metres = math.dist(measured.position_m, found.translation_m)
         if measured.rotation is None:
-            return Correction(metres, None)
+            return MeasurementError(metres, None)
         was = Pose((0.0, 0.0, 0.0), measured.rotation).inverse()
         turn = was.compose(Pose((0.0, 0.0, 0.0), found.rotation))
-        return Correction(metres, math.degrees(math.hypot(*rotation_vector(turn.rotation))))
+        return MeasurementError(metres, math.degrees(math.hypot(*rotation_vector(turn.rotation))))
 
     def _learn(self, measured: PoseMeasurement, track: Track) -> None:
         if abs(measured.time_ns - track.time_ns) > 1e9 * COMPARED_S:
             return
         there = track.predicted(measured.time_ns)
         if self.bias.time_ns is not None and self.bias.surprise(measured, there) > JUMP:
-            self._counts[Event.JUMPED] += 1
+            self._counts[TrackerEvent.JUMPED] += 1
             self._jumps += 1
             if self._jumps < BELIEVED_JUMPS:
                 return

@@ -1,12 +1,15 @@
-"""What is known of a pose before the picture was looked at, and where it pays to look.
+"""Knowledge of a pose before its picture is looked at: measurements, priors and where to search.
 
-Vehicles know their pose from satellite navigation and a compass, to metres and degrees. Features of
-a picture are found again in a render that was made some way off, so few renders cover such a prior:
-the pose itself first, then rings of poses around it, the nearest first.
+A feed turns whatever a sensor says (satellite navigation, a compass, a dataset's poses) into
+``PoseMeasurement``, in the axes of the field's tile and of the camera, on the camera's clock. The
+tracker (``rfcore.localise.tracker``) uses measurements as priors, never as poses to send.
 
-How far off a render may be depends on how far away the scene is: a picture changes with the ratio
-of the movement to the depth. The distance between rings therefore is a share of the scene's median
-depth, and nothing here depends on the unit of length of the field.
+Vehicles know their pose to metres and degrees. Features of a picture are found again in a render
+that was made some way off, so few renders cover such a prior: the pose itself first, then rings of
+poses around it, the nearest first. How far off a render may be depends on how far away the scene
+is: a picture changes with the ratio of the movement to the depth. The distance between rings
+therefore is a share of the scene's median depth, and nothing here depends on the unit of length of
+the field.
 """
 
 from __future__ import annotations
@@ -19,8 +22,9 @@ from rfcore.camera import Pose, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.motion import quaternion_from_vector, rotation_vector
 
-__all__ = ["PosePrior", "hypotheses", "moved"]
+__all__ = ["PoseMeasurement", "PosePrior", "hypotheses", "moved"]
 
+MAX_TIME_NS = 1 << 64
 REACH_OF_DEPTH = 0.25
 """Distance between rings, as a share of the scene's median depth."""
 REACH_DEG = 12.0
@@ -32,6 +36,44 @@ AROUND = 6
 """Poses of the innermost ring; the n-th has n times as many."""
 PLAUSIBLE = 4.0
 """How many standard deviations a pose may lie from the prior; more refutes it."""
+
+
+@dataclass(frozen=True)
+class PoseMeasurement:
+    """A measured pose of the camera; standard deviations are one sigma.
+
+    Raises ``InvalidInput`` for values that are not finite, a quaternion that is not a unit one, a
+    deviation that is not above 0, or a time outside uint64.
+    """
+
+    time_ns: int
+    """When the camera was there, nanoseconds of the Unix epoch."""
+    position_m: Vec3
+    """Position of the camera's centre in the tile's frame: east, north, up."""
+    position_std_m: Vec3
+    """Standard deviations of east, north and up."""
+    rotation: tuple[float, float, float, float] | None = None
+    """world_from_cam, w, x, y, z; ``None`` where no direction was measured."""
+    rotation_std_deg: float = 5.0
+    """Standard deviation of the rotation, mostly of the heading; unused without a rotation."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.time_ns < MAX_TIME_NS:
+            raise InvalidInput("measurement.time_ns", f"{self.time_ns} is outside 0..2**64 - 1")
+        Pose(self.position_m, self.rotation or (1.0, 0.0, 0.0, 0.0))
+        for name, values in (
+            ("position_std_m", self.position_std_m),
+            ("rotation_std_deg", (self.rotation_std_deg,)),
+        ):
+            if not all(math.isfinite(value) and value > 0 for value in values):
+                raise InvalidInput(
+                    f"measurement.{name}", f"{values} must be finite and above 0, one sigma"
+                )
+
+    @property
+    def world_from_cam(self) -> Pose | None:
+        """The whole pose; ``None`` without a rotation."""
+        return None if self.rotation is None else Pose(self.position_m, self.rotation)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""The local structure of a picture: its luma less its blur, by the local contrast.
+"""The local structure of a picture: its luma less its blur, divided by the local contrast.
 
-What is coarser than a few pixels is lighting, not structure; contrast depends on exposure. Of both
-a comparison of a picture with a render had better not depend.
+What is coarser than a few pixels is lighting, and contrast depends on exposure. A comparison of a
+picture with a render should depend on neither.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Pyramid:
             self._lumas.append(luma)
 
     def __len__(self) -> int:
-        """How many levels there are."""
+        """Return the number of levels."""
         return len(self._lumas)
 
     @property

@@ -1,15 +1,15 @@
 """The camera's pose from picture to picture: Lost -> Localising -> Tracking, or lost again.
 
 A machine without clock, threads or I/O. Every picture is handed over with its capture time; what
-sensors measured is handed over as it comes. The answer to a picture is a ``Fix``: the field as
-rendered at the pose to send, or that the camera is not known to be anywhere.
+sensors measured is handed over as it comes. The answer to a picture is a ``PoseEstimate``: the
+field as rendered at the pose to send, or that the pose is not known.
 
-* *Lost*: no track, and nothing that tells where to search, or a search that has just failed.
+* *Lost*: there is no track, and nothing tells where to search, or a search has just failed.
 * *Localising*: a search (``rfcore.localise.localiser``) is to be run or is running. The machine
-  hands out a ``SearchJob``; whoever drives it runs the job when and where it likes and brings the
-  answer back (``searched``). By then newer pictures have come: the pose found is carried forward by
-  what is known of the motion and aligned with the next picture. Where no motion is known, the one
-  who ran the job looks for the newest picture, too, from the pose found, which is soon done.
+  hands out a ``SearchJob``; its driver runs the job when and where it likes and brings the answer
+  back (``searched``). By then newer pictures have come: the pose found is carried forward by what
+  is known of the motion and aligned with the next picture. Where no motion is known, the driver
+  also looks for the newest picture, from the pose found, which is soon done.
 * *Tracking*: each picture is predicted, aligned and checked (``rfcore.localise.track``). The check
   is of the render at the very pose to be sent; a pose that does not pass is never sent.
 
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -31,24 +31,23 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import FULL, Bounds, Quality, Renderer, render_field_view
 from rfcore.image import I420
 from rfcore.localise.alignment import Expected
-from rfcore.localise.fix import Event, Fix, State
-from rfcore.localise.localiser import Localised, Localiser, LocaliserSettings, Lost
+from rfcore.localise.estimate import LocalisationState, PoseEstimate, TrackerEvent
+from rfcore.localise.localiser import Localised, Localiser, Lost
 from rfcore.localise.measured_poses import UNKNOWN_SPEED_M_S, MeasuredPoses
-from rfcore.localise.measurement import PoseMeasurement
-from rfcore.localise.prior import PosePrior
+from rfcore.localise.prior import PoseMeasurement, PosePrior
 from rfcore.localise.structure import Pyramid
 from rfcore.localise.track import (
-    Effort,
+    LONGEST_GAP_S,
     Motion,
     RenderAt,
     Track,
-    TrackSettings,
-    begun,
-    followed,
+    TrackingBudget,
+    begin_track,
+    follow_track,
 )
 from rfcore.views import FieldView
 
-__all__ = ["PoseTracker", "SearchJob", "Seen", "TrackerSettings", "full_range"]
+__all__ = ["PoseTracker", "SearchJob", "TimedPose", "full_range"]
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -69,21 +68,12 @@ RECENT_M, RECENT_DEG, RECENT_DEG_PER_S = 0.5, 1.5, 4.0
 """How far a camera that was just seen is from where it is expected: one sigma, and its growth."""
 
 
-@dataclass(frozen=True)
-class TrackerSettings:
-    """Settings of the two halves."""
-
-    search: LocaliserSettings = field(default_factory=LocaliserSettings)
-    track: TrackSettings = field(default_factory=TrackSettings)
-
-
-DEFAULTS = TrackerSettings()
-ONE_MORE_RENDER = Effort(1)
+ONE_MORE_RENDER = TrackingBudget(1)
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Where the camera was at a time."""
+class TimedPose:
+    """A pose of the camera at a time."""
 
     time_ns: int
     world_from_cam: Pose
@@ -91,10 +81,10 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class SearchJob:
-    """A search to be run: ``Localiser.localise_luma(luma, prior)``, anywhere, then ``searched``.
+    """A search to be run: ``Localiser.localise_luma(luma, prior)``, then ``PoseTracker.searched``.
 
-    ``motion``: of the camera, where known. Where it is not, a pose that was found says little about
-    the pictures taken meanwhile, and whoever runs the job looks where a later one was taken.
+    Where the camera's ``motion`` is not known, a pose that was found says little about the pictures
+    taken meanwhile, and whoever runs the job looks where a later one was taken (``later``).
     """
 
     number: int
@@ -103,39 +93,39 @@ class SearchJob:
     prior: PosePrior
     motion: Motion | None = None
 
-    def later(self, found: Pose, time_ns: int, luma: U8, localiser: Localiser) -> Seen | None:
+    def later(self, found: Pose, time_ns: int, luma: U8, localiser: Localiser) -> TimedPose | None:
         """Return where a picture was taken later than the job's, in which the camera was found.
 
         None where the motion is known already, or it was not found.
         """
         if self.motion is not None or time_ns <= self.time_ns:
             return None
-        prior = _expected_since(Seen(self.time_ns, found), None, time_ns)
+        prior = _expected_since(TimedPose(self.time_ns, found), None, time_ns)
         pose = localiser.again(luma, prior)
-        return None if pose is None else Seen(time_ns, pose)
+        return None if pose is None else TimedPose(time_ns, pose)
 
 
 class PoseTracker:
-    """Follows one camera in one field; one caller at a time. ``counts``: how often what happened.
+    """Follows one camera in one field, for one caller at a time.
 
-    ``bounds``: of the field, where known: measurements far outside are not searched at.
+    ``counts`` says how often each event happened. Measurements far outside the field's ``bounds``
+    are ignored, if they are given.
     """
 
     def __init__(
         self,
         renderer: Renderer,
         intrinsics: Intrinsics,
-        settings: TrackerSettings = DEFAULTS,
         bounds: Bounds | None = None,
     ) -> None:
-        self._renderer, self._intrinsics, self._settings = renderer, intrinsics, settings
-        self.counts: Counter[Event] = Counter()
-        self.state = State.LOST
+        self._renderer, self._intrinsics = renderer, intrinsics
+        self.counts: Counter[TrackerEvent] = Counter()
+        self.state = LocalisationState.LOST
         self.feed = MeasuredPoses(self.counts, bounds)
         self._time_ns: int | None = None
         self._track: Track | None = None
-        self._found: Seen | None = None
-        self._seen: Seen | None = None
+        self._found: TimedPose | None = None
+        self._seen: TimedPose | None = None
         self._motion: Motion | None = None
         self._inliers: int | None = None
         self._job: SearchJob | None = None
@@ -144,12 +134,12 @@ class PoseTracker:
 
     def localiser(self, quality: Quality = FULL) -> Localiser:
         """Return what runs the search jobs; it may be used on another thread."""
-        return Localiser(self._renderer, self._intrinsics, self._settings.search, quality)
+        return Localiser(self._renderer, self._intrinsics, quality=quality)
 
     def expect(self, time_ns: int) -> None:
         """The next picture is of this time; measurements after an earlier one belong to it."""
         if self._time_ns is not None and time_ns < self._time_ns:
-            self.counts[Event.TIME_REVERSED] += 1
+            self.counts[TrackerEvent.TIME_REVERSED] += 1
             self._forget()
         self._time_ns = time_ns
 
@@ -163,49 +153,49 @@ class PoseTracker:
         time_ns: int,
         *,
         quality: Quality = FULL,
-        effort: Effort = ONE_MORE_RENDER,
-        odometry: Pose | None = None,
-    ) -> Fix:
+        budget: TrackingBudget = ONE_MORE_RENDER,
+    ) -> PoseEstimate:
         """Return what is known of the pose of a picture taken at ``time_ns``.
 
-        ``odometry``: the pose of this camera in the axes of the one of the picture before, where a
-        sensor measured it. A picture of an earlier time than the last begins anew.
+        A picture of an earlier time than the last begins anew.
         """
         self.expect(time_ns)
         levels = Pyramid(frame.y)
         render_at = partial(self._render_at, quality)
-        track = self._followed(levels, time_ns, render_at, effort, odometry)
+        track = self._followed(levels, time_ns, render_at, budget)
         if track is None:
             track = self._carried(levels, time_ns, render_at)
         if track is not None:
             return self._tracking(track)
         self._want_search(frame, time_ns)
-        self.state = State.LOST if self._job is None else State.LOCALISING
-        return Fix(self.state, time_ns, inliers=self._inliers)
+        self.state = LocalisationState.LOST if self._job is None else LocalisationState.LOCALISING
+        return PoseEstimate(self.state, time_ns, inliers=self._inliers)
 
     def search(self) -> SearchJob | None:
         """Return the search to be run, once; ``None`` while there is none to begin."""
         if self._job is None or self._handed_out:
             return None
         self._handed_out = True
-        self.counts[Event.SEARCHED] += 1
+        self.counts[TrackerEvent.SEARCHED] += 1
         return self._job
 
-    def searched(self, job: SearchJob, answer: Localised | Lost, later: Seen | None = None) -> None:
+    def searched(
+        self, job: SearchJob, answer: Localised | Lost, later: TimedPose | None = None
+    ) -> None:
         """Take in what a search found, and where the camera was ``later``, if that was looked for.
 
-        An answer to a job that was given up is left out.
+        An answer to a job that was given up is ignored.
         """
         if self._job is None or job.number != self._job.number:
             return
         self._job, self._handed_out = None, False
         if isinstance(answer, Lost):
-            self.counts[Event.NOT_FOUND] += 1
+            self.counts[TrackerEvent.NOT_FOUND] += 1
             self._failed(job.time_ns)
             return
-        self.counts[Event.FOUND] += 1
+        self.counts[TrackerEvent.FOUND] += 1
         self._failures, self._inliers = 0, answer.solution.inliers
-        self._found = Seen(job.time_ns, answer.world_from_cam)
+        self._found = TimedPose(job.time_ns, answer.world_from_cam)
         self._note(self._found)
         if later is not None:
             self._found = later
@@ -220,50 +210,48 @@ class PoseTracker:
         levels: Pyramid,
         time_ns: int,
         render_at: RenderAt,
-        effort: Effort,
-        odometry: Pose | None,
+        budget: TrackingBudget,
     ) -> Track | None:
-        track, settings = self._track, self._settings.track
+        track = self._track
         if track is None:
             return None
         found = None
-        if 0 < time_ns - track.time_ns <= 1e9 * settings.longest_gap_s:
-            found = followed(track, time_ns, levels, render_at, settings, effort, odometry)
+        if 0 < time_ns - track.time_ns <= 1e9 * LONGEST_GAP_S:
+            found = follow_track(track, time_ns, levels, render_at, budget)
         if found is None:
-            self.counts[Event.TRACK_LOST] += 1
+            self.counts[TrackerEvent.TRACK_LOST] += 1
             self._track = None
         return found
 
     def _carried(self, levels: Pyramid, time_ns: int, render_at: RenderAt) -> Track | None:
         """Return the track that begins with a pose found in an earlier picture, or in this one."""
         found, self._found = self._found, None
-        settings = self._settings.track
-        if found is None or time_ns - found.time_ns > 1e9 * settings.longest_gap_s:
+        if found is None or time_ns - found.time_ns > 1e9 * LONGEST_GAP_S:
             return None
         seconds = (time_ns - found.time_ns) / 1e9
         if seconds == 0:
-            return begun(time_ns, found.world_from_cam, None, levels, render_at, settings)
+            return begin_track(time_ns, found.world_from_cam, None, levels, render_at)
         moved = (self._motion or Motion()).over(seconds)
         speed_m_s = math.hypot(*moved.translation_m) / seconds
         off_m = CARRY_OF_MOTION * seconds * (speed_m_s if self._motion else UNKNOWN_SPEED_M_S)
         expected = Expected(RECENT_M / 2 + off_m, math.radians(RECENT_DEG))
         near = found.world_from_cam.compose(moved)
-        track = begun(time_ns, near, expected, levels, render_at, settings, CARRY_ALIGNMENTS)
+        track = begin_track(time_ns, near, expected, levels, render_at, CARRY_ALIGNMENTS)
         if track is None:
             self._motion = None  # it led elsewhere: the next search learns it anew
         return track
 
-    def _tracking(self, track: Track) -> Fix:
-        self.counts[Event.TRACKED] += 1
-        self.counts[Event.REDRAWN] += track.renders > 1
+    def _tracking(self, track: Track) -> PoseEstimate:
+        self.counts[TrackerEvent.TRACKED] += 1
+        self.counts[TrackerEvent.REDRAWN] += track.renders > 1
         self._job, self._handed_out, self._found = None, False, None
         self._failures, self._pause_until_ns = 0, 0
-        self._note(Seen(track.time_ns, track.world_from_cam))
+        self._note(TimedPose(track.time_ns, track.world_from_cam))
         self._motion = track.motion or self._motion
         self._track = track if track.motion else replace(track, motion=self._motion)
-        self.state = State.TRACKING
-        return Fix(
-            State.TRACKING,
+        self.state = LocalisationState.TRACKING
+        return PoseEstimate(
+            LocalisationState.TRACKING,
             track.time_ns,
             track.view,
             track.covariance,
@@ -281,7 +269,7 @@ class PoseTracker:
             pause_s = min(FIRST_PAUSE_S * 2 ** min(self._failures, 10), LONGEST_PAUSE_S)
             self._pause_until_ns = time_ns + round(1e9 * pause_s)
         if self._track is None:
-            self.state = State.LOST
+            self.state = LocalisationState.LOST
 
     def _want_search(self, frame: I420, time_ns: int) -> None:
         """Prepare a search with this picture unless one is under way or nothing tells where."""
@@ -311,7 +299,7 @@ class PoseTracker:
             return None
         return _expected_since(seen, self._motion, time_ns)
 
-    def _note(self, seen: Seen) -> None:
+    def _note(self, seen: TimedPose) -> None:
         """Remember where the camera was, and learn its motion from two poses of near times.
 
         A camera that is where it cannot have driven to was not seen between: its motion is kept.
@@ -332,7 +320,7 @@ class PoseTracker:
         self.feed.forget()
 
 
-def _expected_since(seen: Seen, motion: Motion | None, time_ns: int) -> PosePrior:
+def _expected_since(seen: TimedPose, motion: Motion | None, time_ns: int) -> PosePrior:
     """Return where a camera is expected that was seen a moment before."""
     seconds = (time_ns - seen.time_ns) / 1e9
     moved = (motion or Motion()).over(seconds)

@@ -13,7 +13,7 @@ from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import RejectReason
 from rfcore.field import FULL, Quality, Renderer, render_field_view
-from rfcore.localise.fix import State
+from rfcore.localise.estimate import LocalisationState
 from rfcore.views import FieldView
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.sensing import ClockKind
@@ -111,7 +111,7 @@ class Frame:
     packet: DeltaPacket
     quality: Quality = FULL
     clock: ClockKind | None = None
-    localisation: State | None = None
+    localisation: LocalisationState | None = None
     instant: int = 0
 
     @property

@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Final
 
-from rfcore.localise.fix import State
+from rfcore.localise.estimate import LocalisationState
 from rfcore.wire.v1 import edge_pb2 as pb
 
 __all__ = [
@@ -33,12 +33,12 @@ CLOCKS: Final = {
     ClockKind.ARRIVAL: pb.CAPTURE_CLOCK_ARRIVAL,
 }
 STATES: Final = {
-    State.LOST: pb.LOCALISATION_LOST,
-    State.LOCALISING: pb.LOCALISATION_LOCALISING,
-    State.TRACKING: pb.LOCALISATION_TRACKING,
+    LocalisationState.LOST: pb.LOCALISATION_LOST,
+    LocalisationState.LOCALISING: pb.LOCALISATION_LOCALISING,
+    LocalisationState.TRACKING: pb.LOCALISATION_TRACKING,
 }
 CLOCK_OF: Final[dict[int, ClockKind]] = {number: clock for clock, number in CLOCKS.items()}
-STATE_OF: Final[dict[int, State]] = {number: state for state, number in STATES.items()}
+STATE_OF: Final[dict[int, LocalisationState]] = {number: state for state, number in STATES.items()}
 
 
 def clock_to_wire(clock: ClockKind | None) -> pb.CaptureClock.ValueType:
@@ -51,11 +51,11 @@ def clock_from_wire(number: int) -> ClockKind | None:
     return CLOCK_OF.get(number)
 
 
-def localisation_to_wire(state: State | None) -> pb.Localisation.ValueType:
+def localisation_to_wire(state: LocalisationState | None) -> pb.Localisation.ValueType:
     """Return the number of ``state``; 0 for none: the pose was given."""
     return pb.LOCALISATION_UNSPECIFIED if state is None else STATES[state]
 
 
-def localisation_from_wire(number: int) -> State | None:
+def localisation_from_wire(number: int) -> LocalisationState | None:
     """Return which state ``number`` stands for, if any."""
     return STATE_OF.get(number)

@@ -15,7 +15,7 @@ from rfcore.camera import Intrinsics, Pose
 from rfcore.codec.references import Reference, References
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.image import I420, Rgb, rgb_from_bytes
-from rfcore.localise.fix import State
+from rfcore.localise.estimate import LocalisationState
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.perception.objects import CameraKey
 from rfcore.wire.checks import check_name, check_range
@@ -100,7 +100,7 @@ class TwinPicture:
     payload_bytes: int = 0
     references: References = ()
     clock: ClockKind | None = None
-    localisation: State | None = None
+    localisation: LocalisationState | None = None
     instant: int = 0
 
     @property

@@ -21,7 +21,7 @@ from rfcore.field import FULL, Renderer
 from rfcore.files import write_whole
 from rfcore.image import Rgb
 from rfcore.localise.localiser import LocaliserSettings, Lost, Obstacle
-from rfcore.localise.matching import features, grey, lifted, matched
+from rfcore.localise.matching import find_features, grey, lift_matches, match_features
 from rfedge.localisation.searches import SearchOutcome, SearchSummary, pose_difference
 from rfedge.report.charts import BLUE, GREY, RENDER, embedded, new_axes, svg
 from rfedge.results import provenance
@@ -132,9 +132,9 @@ def _drawn(field: Renderer, attempt: SearchOutcome, pose: Pose) -> tuple[Rgb, in
     view = field.render(camera, FULL)
     render = np.clip(view.colour * 255 + 0.5, 0, 255).astype(np.uint8)
     rgb = attempt.picture.read()
-    seen, drawn = features(grey(rgb), settings.features), features(grey(render), settings.features)
-    pairs = matched(seen, drawn, settings.ratio)
-    matches = lifted(pairs, view, k, settings.least_confidence)
+    seen, drawn = (find_features(grey(picture), settings.features) for picture in (rgb, render))
+    pairs = match_features(seen, drawn, settings.ratio)
+    matches = lift_matches(pairs, view, k, settings.least_confidence)
     z = matches.xyz_m[:, 2:]
     focal, centre = (k.fx_px, k.fy_px), (k.cx_px - 0.5, k.cy_px - 0.5)
     there_px = matches.xyz_m[:, :2] / z * focal + centre

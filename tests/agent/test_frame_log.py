@@ -24,7 +24,7 @@ from cav_agent.metrics import AgentMetrics
 from cav_agent.rate_control import ByteBudget
 from rfcore.codec.sender.ladder import MeasuredRung, Rung
 from rfcore.errors import RejectReason
-from rfcore.localise.fix import Fix, State
+from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.wire.address import Address
 from rfcore.wire.messages import StageTimes
 from rfcore.wire.tiles import Tile
@@ -170,7 +170,7 @@ def test_the_pose_feeds_time_offset_is_a_metric_and_logged_when_it_changed(
     assert acked.encoded is not None
     with capture_logs() as lines:
         for offset_s in (None, 0.21, 0.23, 0.4):
-            fix = Fix(State.TRACKING, 0, feed_offset_s=offset_s)
+            fix = PoseEstimate(LocalisationState.TRACKING, 0, feed_offset_s=offset_s)
             observer.ended(replace(acked, encoded=replace(acked.encoded, fix=fix)))
     told = [line["seconds"] for line in lines if line["event"] == "pose feed's time offset"]
     assert told == [0.21, 0.4]

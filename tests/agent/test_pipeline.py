@@ -19,7 +19,7 @@ from rfcore.codec.sender.ladder import Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, render_field_view
 from rfcore.image import I420, Rgb
-from rfcore.localise.fix import Fix, State
+from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.views import FieldView, View
 from rfcore.wire.messages import FrameAddress
 
@@ -118,13 +118,13 @@ class Places:
     def __init__(self) -> None:
         self.calls = 0
 
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> PoseEstimate:
         del frame
         self.calls += 1
         if self.calls % 2:
-            return Fix(State.LOCALISING, capture.capture_time_ns)
+            return PoseEstimate(LocalisationState.LOCALISING, capture.capture_time_ns)
         view = render_field_view(Grey(), capture.picture.camera.rounded(), rung.quality)
-        return Fix(State.TRACKING, capture.capture_time_ns, view)
+        return PoseEstimate(LocalisationState.TRACKING, capture.capture_time_ns, view)
 
 
 def test_lost_frames_are_coded_without_the_field_and_found_ones_with_it(noisy: Capture) -> None:

@@ -12,7 +12,7 @@ from cav_agent.rig_poses import DrivenRig, MeasuredRig, TrackedRig
 from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
 from rfcore.codec.sender.ladder import FULL_RUNG, Rung
 from rfcore.image import I420
-from rfcore.localise.fix import Fix, State
+from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.views import FieldView
 
 MakeCapture = Callable[..., Capture]
@@ -38,12 +38,12 @@ class Reference:
         pose = camera_on_rig(driving(capture.capture_time_ns / NS), CAMERA_FROM_RIG)
         return Camera(INTRINSICS, pose)
 
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> PoseEstimate:
         assert (frame, rung) == (GREY, FULL_RUNG)
         if not self.found:
-            return Fix(State.LOST, capture.capture_time_ns)
+            return PoseEstimate(LocalisationState.LOST, capture.capture_time_ns)
         view = replace(FieldView.nothing(INTRINSICS), camera=self.camera(capture))
-        return Fix(State.TRACKING, capture.capture_time_ns, view)
+        return PoseEstimate(LocalisationState.TRACKING, capture.capture_time_ns, view)
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_where_the_reference_is_lost_the_rig_is(at: Callable[[float], Capture]) 
     rig.locate(at(1.0), GREY, FULL_RUNG)
     reference.found = False
     rig.locate(at(1.1), GREY, FULL_RUNG)
-    assert rig.at(at(1.12)) == RigPose(None, State.LOST)
+    assert rig.at(at(1.12)) == RigPose(None, LocalisationState.LOST)
 
 
 def test_once_the_reference_is_gone_measured_poses_take_over(

@@ -18,7 +18,7 @@ from rfcore.dataset.trajectory import read_trajectory
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.field import Bounds, load_field
 from rfcore.localise.localiser import Localised, Lost, Obstacle
-from rfcore.localise.matching import Solution
+from rfcore.localise.matching import PnpSolution
 from rfcore.motion import rotation_vector
 from rfcore.views import PosedPicture
 from rfedge.cli.dataset import DatasetConvert
@@ -52,7 +52,7 @@ def outcome(number: int, error_m: float | None, time_ns: int = 0) -> SearchOutco
     """A search that was lost, or found a pose; right where it is within 0.01 m."""
     if error_m is None:
         return SearchOutcome(picture(number, time_ns), POSE, LOST, None, None, False, 100.0, 90.0)
-    found = Localised(Solution(POSE, 90, 0.5), 80.0, 1)
+    found = Localised(PnpSolution(POSE, 90, 0.5), 80.0, 1)
     right = error_m < 0.01
     return SearchOutcome(picture(number, time_ns), POSE, found, error_m, 0.02, right, 300.0, 250.0)
 
@@ -186,7 +186,7 @@ def test_poses_that_were_found_tell_how_late_a_feed_is(tmp_path: Path, late_s: f
         replace(
             outcome(n, 0.001),
             picture=p,
-            answer=Localised(Solution(p.camera.world_from_cam, 90, 0.5), 80.0, 1),
+            answer=Localised(PnpSolution(p.camera.world_from_cam, 90, 0.5), 80.0, 1),
         )
         for n, p in enumerate(pictures)
     ]

@@ -25,7 +25,7 @@ from rfcore.localise.localiser import (
 from rfcore.localise.matching import grey
 from rfcore.localise.prior import PosePrior, moved
 from rfcore.localise.structure import Pyramid, halved, structure
-from rfcore.localise.track import Track, TrackSettings, begun
+from rfcore.localise.track import Track, begin_track
 from rfcore.localise.tracker import CARRY_ALIGNMENTS, full_range
 from rfcore.motion import rotation_vector
 from rfcore.views import FieldView, PosedPicture, View
@@ -155,7 +155,7 @@ def carried(taken: PosedPicture, off_m: Vec3) -> Track | None:
 
     near = moved(taken.camera.world_from_cam, off_m, (0.0, math.radians(0.7), 0.0))
     expected, levels = Expected(0.4, math.radians(1.5)), Pyramid(full_range(grey(taken.read())))
-    return begun(0, near, expected, levels, render_at, TrackSettings(), CARRY_ALIGNMENTS)
+    return begin_track(0, near, expected, levels, render_at, CARRY_ALIGNMENTS)
 
 
 @pytest.mark.parametrize(("number", "drive"), [(9, "empty"), (21, "vehicles")])

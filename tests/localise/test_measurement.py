@@ -7,7 +7,7 @@ import pytest
 
 from rfcore.camera import Pose
 from rfcore.errors import InvalidInput
-from rfcore.localise.measurement import PoseMeasurement
+from rfcore.localise.prior import PoseMeasurement
 
 GOOD: dict[str, Any] = {
     "time_ns": 1,

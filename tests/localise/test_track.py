@@ -14,12 +14,17 @@ from rfcore.camera import Camera, Pose
 from rfcore.field import FULL, Quality, Renderer, render_field_view
 from rfcore.localise.alignment import Template
 from rfcore.localise.structure import Pyramid
-from rfcore.localise.track import Effort, RenderAt, Track, TrackSettings, begun, followed
+from rfcore.localise.track import (
+    RenderAt,
+    Track,
+    TrackingBudget,
+    begin_track,
+    follow_track,
+)
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.views import View
 
 TEMPLATE = Template.of(render_field_view(Planes(), Camera(INTRINSICS, Pose.identity())))
-SETTINGS = TrackSettings()
 METRES = st.floats(-0.3, 0.3)
 RADIANS = st.floats(-0.02, 0.02)
 
@@ -72,7 +77,7 @@ def drawn_by(renderer: Renderer) -> RenderAt:
 
 def begun_at(pose: Pose, renderer: Renderer) -> Track:
     """Return the track that begins with the picture taken at a pose."""
-    track = begun(0, pose, None, Pyramid(picture(pose).y), drawn_by(renderer), SETTINGS)
+    track = begin_track(0, pose, None, Pyramid(picture(pose).y), drawn_by(renderer))
     assert track is not None
     return track
 
@@ -80,7 +85,7 @@ def begun_at(pose: Pose, renderer: Renderer) -> Track:
 def followed_to(pose: Pose, number: int, track: Track, renderer: Renderer) -> Track:
     """Return the track with the picture taken at a pose, the one of that number at 10 Hz."""
     levels, time_ns = Pyramid(picture(pose).y), number * 10**8
-    further = followed(track, time_ns, levels, drawn_by(renderer), SETTINGS, Effort(1))
+    further = follow_track(track, time_ns, levels, drawn_by(renderer), TrackingBudget(1))
     assert further is not None
     return further
 
@@ -101,11 +106,11 @@ def test_tracking_from_half_the_resolution_on_leaves_the_finest_level_out() -> N
     def at(number: int) -> Pose:
         return Pose((0.02 * number, 0.0, 0.1 * number), (1.0, 0.0, 0.0, 0.0))
 
-    half = Effort(0, finest=1)
+    half = TrackingBudget(0, finest=1)
     track = begun_at(at(0), Planes())
     for number in range(1, 6):
         levels = Pyramid(picture(at(number)).y)
-        further = followed(track, number * 10**8, levels, drawn_by(Planes()), SETTINGS, half)
+        further = follow_track(track, number * 10**8, levels, drawn_by(Planes()), half)
         assert further is not None
         track = further
         assert track.renders == 1

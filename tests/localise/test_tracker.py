@@ -12,11 +12,10 @@ from localise.planes import INTRINSICS, Planes, picture
 from rfcore.camera import Pose
 from rfcore.image import I420
 from rfcore.localise.agreement import agreement_on_track
-from rfcore.localise.fix import Event, Fix, State
+from rfcore.localise.estimate import LocalisationState, PoseEstimate, TrackerEvent
 from rfcore.localise.localiser import Localised, Lost, Obstacle
-from rfcore.localise.matching import Solution
-from rfcore.localise.measurement import PoseMeasurement
-from rfcore.localise.prior import moved
+from rfcore.localise.matching import PnpSolution
+from rfcore.localise.prior import PoseMeasurement, moved
 from rfcore.localise.structure import Pyramid
 from rfcore.localise.tracker import PoseTracker
 from rfcore.motion import rotation_vector
@@ -50,7 +49,7 @@ def measured(number: int, off: Pose | None = None, time_ns: int | None = None) -
 
 
 def found(pose: Pose) -> Localised:
-    return Localised(Solution(pose, 100, 0.5), 50.0, 1)
+    return Localised(PnpSolution(pose, 100, 0.5), 50.0, 1)
 
 
 def driven(
@@ -59,7 +58,7 @@ def driven(
     frame: I420 | None = None,
     answer: Callable[[int], Localised | Lost] = lambda number: found(pose_of(number)),
     time_ns: int | None = None,
-) -> Fix:
+) -> PoseEstimate:
     """Hand over a picture; a search that is wanted is answered at once."""
     frame, time_ns = FRAMES[number] if frame is None else frame, time_ns or time_of(number)
     fix = tracker.locate(frame, time_ns)
@@ -70,7 +69,7 @@ def driven(
     return tracker.locate(frame, time_ns)
 
 
-def error_m(fix: Fix, number: int) -> float:
+def error_m(fix: PoseEstimate, number: int) -> float:
     assert fix.world_from_cam is not None
     return math.hypot(*pose_of(number).inverse().compose(fix.world_from_cam).translation_m)
 
@@ -79,13 +78,13 @@ def tracking(count: int = 3) -> PoseTracker:
     tracker = PoseTracker(Planes(), INTRINSICS)
     for number in range(count):
         tracker.measure(measured(number))
-        assert driven(tracker, number).state is State.TRACKING
+        assert driven(tracker, number).state is LocalisationState.TRACKING
     return tracker
 
 
 def test_without_a_measurement_it_is_lost_and_searches_nowhere() -> None:
     tracker = PoseTracker(Planes(), INTRINSICS)
-    assert tracker.locate(FRAMES[0], time_of(0)).state is State.LOST
+    assert tracker.locate(FRAMES[0], time_of(0)).state is LocalisationState.LOST
     assert tracker.search() is None
 
 
@@ -94,9 +93,9 @@ def test_a_drive_is_followed_to_millimetres_after_one_search() -> None:
     for number in range(10):
         tracker.measure(measured(number, Pose((0.3, 0.1, -0.2), NO_TURN)))
         fix = driven(tracker, number)
-        assert fix.state is State.TRACKING
+        assert fix.state is LocalisationState.TRACKING
         assert error_m(fix, number) < 0.02
-    assert tracker.counts[Event.SEARCHED] == 1
+    assert tracker.counts[TrackerEvent.SEARCHED] == 1
 
 
 def test_what_is_sent_is_rounded_and_is_where_the_view_was_rendered() -> None:
@@ -125,17 +124,17 @@ def test_a_constant_offset_is_learnt_and_taken_away_from_the_next_prior() -> Non
 def test_a_silent_feed_is_bridged() -> None:
     tracker = tracking(3)
     for number in range(3, 10):
-        assert driven(tracker, number).state is State.TRACKING
-    assert tracker.counts[Event.SEARCHED] == 1
+        assert driven(tracker, number).state is LocalisationState.TRACKING
+    assert tracker.counts[TrackerEvent.SEARCHED] == 1
 
 
 def test_a_black_picture_is_lost_and_the_next_good_one_is_found_again() -> None:
     tracker = tracking(3)
     black = I420(np.full_like(FRAMES[0].y, 16), FRAMES[0].u, FRAMES[0].v)
     gone = driven(tracker, 3, black, lambda _: Lost(Obstacle.FEW_FEATURES, 0))
-    assert gone.state is not State.TRACKING
+    assert gone.state is not LocalisationState.TRACKING
     assert gone.view is None
-    assert driven(tracker, 4).state is State.TRACKING
+    assert driven(tracker, 4).state is LocalisationState.TRACKING
 
 
 def test_a_search_that_takes_three_pictures_is_carried_forward() -> None:
@@ -153,15 +152,15 @@ def test_a_search_that_takes_three_pictures_is_carried_forward() -> None:
         elif number > 2 and job is not None:
             tracker.searched(job, found(pose_of(number)))
             job = None
-    assert states[0] is State.LOCALISING
-    assert State.TRACKING in states[3:]
-    assert states[-1] is State.TRACKING
+    assert states[0] is LocalisationState.LOCALISING
+    assert LocalisationState.TRACKING in states[3:]
+    assert states[-1] is LocalisationState.TRACKING
 
 
 def test_a_teleport_is_found_again_with_the_second_picture() -> None:
     tracker = tracking(3)
     fix = driven(tracker, 9, time_ns=time_of(3))
-    assert fix.state is State.TRACKING
+    assert fix.state is LocalisationState.TRACKING
     assert error_m(fix, 9) < 0.02
 
 
@@ -169,16 +168,16 @@ def test_a_measurement_of_a_drive_that_begins_again_is_not_backwards() -> None:
     tracker = tracking(4)
     tracker.expect(time_of(0))
     tracker.measure(measured(0))
-    assert tracker.counts[Event.BACKWARDS] == 0
-    assert driven(tracker, 0).state is State.TRACKING
-    assert tracker.counts[Event.TIME_REVERSED] == 1
+    assert tracker.counts[TrackerEvent.BACKWARDS] == 0
+    assert driven(tracker, 0).state is LocalisationState.TRACKING
+    assert tracker.counts[TrackerEvent.TIME_REVERSED] == 1
 
 
 def test_a_found_pose_that_the_picture_does_not_show_is_not_believed() -> None:
     tracker = PoseTracker(Planes(), INTRINSICS)
     tracker.measure(measured(0))
     wrong = found(moved(pose_of(0), (3.0, 0.0, 1.0)))
-    assert driven(tracker, 0, answer=lambda _: wrong).state is not State.TRACKING
+    assert driven(tracker, 0, answer=lambda _: wrong).state is not LocalisationState.TRACKING
 
 
 def test_an_answer_to_a_search_that_was_given_up_is_left_out() -> None:
@@ -189,8 +188,8 @@ def test_an_answer_to_a_search_that_was_given_up_is_left_out() -> None:
     assert job is not None
     tracker.locate(FRAMES[0], time_of(0) - 1)
     tracker.searched(job, found(pose_of(0)))
-    assert tracker.counts[Event.FOUND] == 0
-    assert tracker.counts[Event.TIME_REVERSED] == 1
+    assert tracker.counts[TrackerEvent.FOUND] == 0
+    assert tracker.counts[TrackerEvent.TIME_REVERSED] == 1
 
 
 def test_searches_that_fail_come_less_and_less_often() -> None:
@@ -198,15 +197,15 @@ def test_searches_that_fail_come_less_and_less_often() -> None:
     for number in range(100):
         tracker.measure(measured(0, time_ns=time_of(number)))
         driven(tracker, 0, NOISE, lambda _: Lost(Obstacle.FEW_INLIERS, 7), time_of(number))
-    assert 4 <= tracker.counts[Event.SEARCHED] <= 10
+    assert 4 <= tracker.counts[TrackerEvent.SEARCHED] <= 10
 
 
 def test_a_measurement_of_another_time_is_stated_and_starts_no_search() -> None:
     tracker = PoseTracker(Planes(), INTRINSICS)
     tracker.measure(measured(0, time_ns=time_of(0) + 3_600_000_000_000))
-    assert tracker.locate(FRAMES[0], time_of(0)).state is State.LOST
+    assert tracker.locate(FRAMES[0], time_of(0)).state is LocalisationState.LOST
     assert tracker.search() is None
-    assert tracker.counts[Event.OFF_TIME] == 1
+    assert tracker.counts[TrackerEvent.OFF_TIME] == 1
 
 
 SENSOR_EVENTS = st.sampled_from(["good", "silent", "teleport", "backwards", "far", "off_time"])
@@ -248,7 +247,7 @@ def test_no_feed_and_no_answer_makes_it_claim_what_the_picture_does_not_show(
         if job is not None and answer != "never":
             tracker.searched(job, _answer(answer, place))
             fix = tracker.locate(frame, time_of(number))
-        assert (fix.view is not None) == (fix.state is State.TRACKING)
+        assert (fix.view is not None) == (fix.state is LocalisationState.TRACKING)
         if fix.view is None:
             continue
         assert kind != "noise"

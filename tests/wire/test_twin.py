@@ -9,7 +9,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.references import Reference
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.field.quality import FULL, Quality
-from rfcore.localise.fix import State
+from rfcore.localise.estimate import LocalisationState
 from rfcore.wire.sensing import ClockKind
 from rfcore.wire.twin import (
     Departure,
@@ -42,7 +42,7 @@ from rfcore.wire.v1 import twin_pb2
 PICTURE = TwinPicture(
     "cav-1", "front", "s-1", 3, 7, 10**18, 5, Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)),
     Intrinsics(4, 2, 1.0, 1.5, 2.0, 1.0), "ab" * 32, b"d" * 16, PictureEncoding.PNG, b"png", 9,
-    4321, (Reference.WARP, Reference.RENDER), ClockKind.ARRIVAL, State.TRACKING, 12,
+    4321, (Reference.WARP, Reference.RENDER), ClockKind.ARRIVAL, LocalisationState.TRACKING, 12,
 )  # fmt: skip
 
 

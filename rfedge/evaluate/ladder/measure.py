@@ -33,7 +33,7 @@ from rfcore.errors import CodecError
 from rfcore.field import Quality, RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.localise.structure import Pyramid
-from rfcore.localise.track import Effort, Track, TrackSettings, begun, followed
+from rfcore.localise.track import Track, TrackingBudget, begin_track, follow_track
 from rfcore.metrics import ssim
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView
@@ -221,7 +221,7 @@ def track_drive(
     """Track ``drive`` at its rate; ``None`` if a picture is lost on the way."""
     field.prepare(quality)
     draw = _TimedDrawing(field, drive.pictures[0].camera.intrinsics, quality)
-    effort = Effort(tracking.redraws, tracking.finest_level)
+    effort = TrackingBudget(tracking.redraws, tracking.finest_level)
     step_ns = round(1e9 / drive.name.rate_hz)
     tracks: list[Track] = []
     took_ms: list[float] = []
@@ -242,13 +242,12 @@ def _next(
     drive: Drive,
     picture: Pyramid,
     draw: _TimedDrawing,
-    effort: Effort,
+    effort: TrackingBudget,
 ) -> Track | None:
     """Return the track with one picture more, begun at the dataset's pose."""
-    settings = TrackSettings()
     if tracks:
-        return followed(tracks[-1], time_ns, picture, draw, settings, effort)
-    return begun(time_ns, drive.cameras[0].world_from_cam, None, picture, draw, settings)
+        return follow_track(tracks[-1], time_ns, picture, draw, effort)
+    return begin_track(time_ns, drive.cameras[0].world_from_cam, None, picture, draw)
 
 
 def _summary(tracks: Sequence[Track], took_ms: Sequence[float], render_ms: float) -> TrackedDrive:

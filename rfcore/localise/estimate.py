@@ -1,6 +1,6 @@
-"""What a tracker answers: a camera's state, its pose, and what happened. Needs no extra.
+"""Answers of a tracker: the state of localisation, the pose, and what happened on the way.
 
-So whoever passes answers on (pipelines, metrics, logs) does not import OpenCV.
+This needs no extra, so pipelines, metrics and logs that pass answers on do not import OpenCV.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from numpy.typing import NDArray
 from rfcore.camera import Pose
 from rfcore.views import FieldView
 
-__all__ = ["Correction", "Event", "Fix", "State"]
+__all__ = ["LocalisationState", "MeasurementError", "PoseEstimate", "TrackerEvent"]
 
 F64 = NDArray[np.float64]
 
 
-class State(StrEnum):
-    """What is known of the camera's pose."""
+class LocalisationState(StrEnum):
+    """State of a camera's localisation."""
 
     LOST = "lost"
     LOCALISING = "localising"
     TRACKING = "tracking"
 
 
-class Event(StrEnum):
-    """One kind of thing that happened."""
+class TrackerEvent(StrEnum):
+    """Kinds of events that a tracker counts."""
 
     MEASURED = "measured"
-    """A measurement was taken in."""
+    """A measurement was used."""
     BACKWARDS = "backwards"
-    """A measurement not newer than the one before it was left out."""
+    """A measurement that is not newer than the one before it was ignored."""
     JUMPED = "jumped"
-    """A measurement departed from a good track by more than its errors allow."""
+    """A measurement was further from a good track than its errors allow."""
     OFF_TIME = "off_time"
     """The newest measurement is from another time than the picture: silence, or a wrong clock."""
     OUTSIDE = "outside"
-    """A measurement far outside the field was left out."""
+    """A measurement far outside the field was ignored."""
     TIME_REVERSED = "time_reversed"
     """A picture was taken before the one before it: the track was given up."""
     SEARCHED = "searched"
@@ -57,31 +57,32 @@ class Event(StrEnum):
 
 
 @dataclass(frozen=True)
-class Correction:
-    """How far a pose is from a measurement of its time; degrees where a rotation was measured."""
+class MeasurementError:
+    """Distance of a measurement from the pose found; degrees where a rotation was measured."""
 
     metres: float
     degrees: float | None
 
 
 @dataclass(frozen=True, eq=False)
-class Fix:
-    """What is known of the pose of one picture.
+class PoseEstimate:
+    """The pose of one picture, as far as it is known.
 
-    ``view``: the field at the pose to send, rounded as ever; only while tracking. ``covariance``
-    [6, 6]: metres and radians in the camera's axes. ``correction``: how far the pose is from the
-    measurement of its time, where there is one. ``inliers``: of the last search that found a pose.
-    ``correction_px``: how far off the pose still is. ``renders``: made for this picture.
-    ``feed_offset_s``: add to the sensor's times to get the pictures', where the motion tells.
+    ``view`` shows the field at the pose to send, while tracking. ``covariance`` [6, 6] is in metres
+    and radians in the camera's axes. ``correction`` compares the pose with the measurement of its
+    time, where there is one. ``inliers`` are those of the last search that found a pose.
+    ``correction_px`` is how far off the pose still is. ``renders`` counts those made for this
+    picture. ``feed_offset_s`` is to be added to the sensor's times to get the pictures', where the
+    motion tells.
     """
 
-    state: State
+    state: LocalisationState
     time_ns: int
     view: FieldView | None = None
     covariance: F64 | None = None
     agreement: float = 0.0
     inliers: int | None = None
-    correction: Correction | None = None
+    correction: MeasurementError | None = None
     correction_px: float = 0.0
     renders: int = 0
     feed_offset_s: float | None = None
