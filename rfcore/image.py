@@ -30,6 +30,7 @@ __all__ = [
     "png_bytes",
     "read_rgb",
     "rgb_from_bytes",
+    "rgb_from_colour",
     "rgb_from_video_frame",
     "write_png",
 ]
@@ -49,6 +50,11 @@ HD_LINES = 720
 
 JPEG_QUANTISER = "3"
 """FFmpeg's scale for MJPEG: 2 is best, 31 worst."""
+
+
+def rgb_from_colour(colour: NDArray[np.float32]) -> Rgb:
+    """Return display-referred colour [H, W, 3], nominally 0..1, as 8 bits, rounded half up."""
+    return np.asarray(np.floor(np.clip(colour, 0, 1) * 255 + 0.5), np.uint8)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs, require
 from rfcore.field import RadianceField
-from rfcore.image import I420, Rgb
+from rfcore.image import I420, Rgb, rgb_from_colour
 from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.views import PosedPicture
@@ -421,9 +421,7 @@ def _at_own_size(opened: NamedField, camera: Camera) -> Rgb:
 
 
 def _render(field: RadianceField, camera: Camera) -> Rgb:
-    colour = np.clip(field.render_colour(camera), 0, 1)
-    pixels: Rgb = np.floor(colour * 255 + 0.5).astype(np.uint8)
-    return pixels
+    return rgb_from_colour(field.render_colour(camera))
 
 
 def _say_cost(

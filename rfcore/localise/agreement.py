@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.extras import needs
+from rfcore.image import rgb_from_colour
 from rfcore.localise.matching import grey
 from rfcore.views import FieldView, View
 
 with needs("localise"):
     import cv2
 
-__all__ = ["agreement", "agreement_on_track", "eight_bits", "near_on_the_spot"]
+__all__ = ["agreement", "agreement_on_track", "near_on_the_spot"]
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -57,7 +58,7 @@ def agreement(luma: U8, view: View) -> float:
     if shown.mean() < LEAST_SHOWN:
         return 0.0
     picture = _structure(luma.astype(np.float32), shown)
-    drawn = _structure(grey(eight_bits(view.colour)).astype(np.float32), shown)
+    drawn = _structure(grey(rgb_from_colour(view.colour)).astype(np.float32), shown)
     spectrum = np.fft.rfft2(picture) * np.conj(np.fft.rfft2(drawn))
     likeness = np.fft.irfft2(spectrum, s=luma.shape)
     rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) for n in luma.shape)
@@ -146,9 +147,3 @@ def _structure(luma: F32, shown: NDArray[np.bool_]) -> F32:
     contrast = np.sqrt(cv2.GaussianBlur(fine * fine, (0, 0), 2 * BLUR_PX))
     flat: F32 = np.where(shown, fine / (contrast + np.float32(4)), np.float32(0))
     return flat
-
-
-def eight_bits(colour: F32) -> U8:
-    """Return colour float32 [H, W, 3], nominally 0..1, as uint8."""
-    eight_bits: U8 = np.clip(colour * 255 + 0.5, 0, 255).astype(np.uint8)
-    return eight_bits

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, Renderer, render_field_view
-from rfcore.localise.agreement import agreement, eight_bits
+from rfcore.image import rgb_from_colour
+from rfcore.localise.agreement import agreement
 from rfcore.localise.matching import (
     Features,
     PnpSolution,
@@ -253,7 +254,7 @@ class Localiser:
         for number in range(rounds):
             if solution is not None:
                 start, view = solution.world_from_cam, self._render(solution.world_from_cam)
-            drawn = find_features(grey(eight_bits(view.colour)), s.features, seen.halvings)
+            drawn = find_features(grey(rgb_from_colour(view.colour)), s.features, seen.halvings)
             found = lift_matches(match_features(seen, drawn, s.ratio), view, k, s.least_confidence)
             solution = solve_pose(found, k, start, s.inlier_px if number else s.first_inlier_px)
             least = s.least_inliers if number else s.least_first_inliers

@@ -37,7 +37,6 @@ __all__ = [
     "FieldExport",
     "FieldImport",
     "FieldInfo",
-    "FieldLevels",
     "FieldSlim",
 ]
 
@@ -277,7 +276,11 @@ def _print_fit(fit: Fit) -> None:
 
 @dataclass(frozen=True)
 class FieldSlim:
-    """Keep the splats that matter most, and let them fill the gaps."""
+    """Keep the splats that matter most, and fit them and lower levels of detail to the cameras.
+
+    With --drive alone every splat is kept: they are ordered by what its cameras see of them, and
+    the levels of 50, 25 and 10 % are fitted to the whole.
+    """
 
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name."""
@@ -285,14 +288,14 @@ class FieldSlim:
     """The archive to write."""
     keep: int | None = None
     """How many splats to keep; or --max-mb, --passes or both, which choose that, the steps of every
-    number and the bits of colours, and fit lower levels of detail (with --drive)."""
+    number and the bits of colours, and fit lower levels of detail (with --drive). Default: all."""
     max_mb: float | None = None
-    """At most how many MB the archive may have (10^6 bytes)."""
+    """The archive may have at most so many MB (10^6 bytes)."""
     passes: int | None = None
     """Write the size with the fewest bytes of field and stream over so many passes of --drive:
     its pictures are coded against every size; of those within --max-mb if both are given."""
     drive: Annotated[Path | None, DATASET] = None
-    """Posed pictures whose cameras the field is to serve; their pixels are read for --passes alone.
+    """Posed pictures whose cameras the field is to serve; their pixels are read for --passes only.
     Without this, opacity and area decide what matters."""
     iterations: int = 240
     """Iterations of fitting the survivors, and lower levels, to the full field's renders (with
@@ -304,22 +307,37 @@ class FieldSlim:
 
     def run(self) -> None:
         """Slim and write."""
+        from rich.console import Console
+
         from rfcore.errors import InvalidInput
+        from rfcore.field import save_field
         from rfcore.train.levels import LevelFitConfig
+        from rfedge.fields.describe import size_mb
         from rfedge.fields.slim import slimmed
+        from rfedge.training.finish import fit_levels
 
         _check_out(self.out, ".rff")
         has_goal = self.max_mb is not None or self.passes is not None
-        if (self.keep is None) != has_goal:
+        if self.keep is not None and has_goal:
             raise InvalidInput("keep", "give either --keep, or --max-mb, --passes or both")
+        if self.keep is None and not has_goal and self.drive is None:
+            raise InvalidInput("keep", "give --keep, --max-mb or --passes; or --drive, to keep all")
         field = open_splats(self.field, threads=self.threads)
         config = LevelFitConfig(iterations=self.iterations, threads=self.threads)
-        if self.keep is None:
-            _write_reduced(field, self._sized(field, config), self.out, raw=False)
-            return
         cameras = _cameras_of(self.drive, field) if self.drive is not None else []
-        small = slimmed(field, self.keep, cameras, config)
-        _write_reduced(field, small, self.out, raw=self.raw)
+        if has_goal:
+            written = self._sized(field, config)
+        elif self.keep is not None:
+            written = slimmed(field, self.keep, cameras, config)
+        else:
+            written = fit_levels(field, cameras, config, Console())
+        written = written if self.raw else written.compressed()
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        field_id = save_field(written, self.out)
+        print(
+            f"{self.out}: field {field_id}, {written.primitives:,} of {field.primitives:,} splats, "
+            f"{size_mb(written):.2f} MB"
+        )
 
     def _sized(self, field: SplatField, config: LevelFitConfig) -> SplatField:
         from rich.console import Console
@@ -336,55 +354,11 @@ class FieldSlim:
         return sizer.sized(field, size_goal(self.max_mb, self.passes))
 
 
-@dataclass(frozen=True)
-class FieldLevels:
-    """Order a field's splats by what cameras see of them, and fit 50, 25 and 10 % to the whole."""
-
-    field: Annotated[Path, Positional, FIELD]
-    """The archive (.rff), or the field's name."""
-    drive: Annotated[Path, DATASET]
-    """Posed pictures whose cameras the field is to serve; their pixels are not read."""
-    out: Annotated[Path, RFF]
-    """The archive to write."""
-    iterations: int = 240
-    """Iterations of fitting, per level."""
-    raw: bool = False
-    """Write float32 instead of the compressed form."""
-    threads: int = 2
-    """Threads of the renderer."""
-
-    def run(self) -> None:
-        """Fit and write."""
-        from rich.console import Console
-
-        from rfcore.train.levels import LevelFitConfig
-        from rfedge.training.finish import fit_levels
-
-        _check_out(self.out, ".rff")
-        field = open_splats(self.field, threads=self.threads)
-        config = LevelFitConfig(iterations=self.iterations, threads=self.threads)
-        refined = fit_levels(field, _cameras_of(self.drive, field), config, Console())
-        _write_reduced(field, refined, self.out, raw=self.raw)
-
-
 def _cameras_of(drive: Path, field: SplatField) -> list[Camera]:
     from rfcore.dataset import read_dataset
 
     pictures = read_dataset(drive, tile_origin=field.metadata.tile_origin).pictures
     return [picture.camera for picture in pictures]
-
-
-def _write_reduced(before: SplatField, after: SplatField, out: Path, *, raw: bool) -> None:
-    from rfcore.field import save_field
-    from rfedge.fields.describe import size_mb
-
-    written = after if raw else after.compressed()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    field_id = save_field(written, out)
-    print(
-        f"{out}: field {field_id}, {written.primitives:,} of {before.primitives:,} splats, "
-        f"{size_mb(written):.2f} MB"
-    )
 
 
 def _check_out(out: Path, suffix: str) -> None:
@@ -445,7 +419,6 @@ class Field:
         | Annotated[FieldInfo, subcommand("info")]
         | Annotated[FieldCheck, subcommand("check")]
         | Annotated[FieldSlim, subcommand("slim")]
-        | Annotated[FieldLevels, subcommand("levels")]
         | Annotated[FieldUpdate, subcommand("update")]
         | Annotated[FieldDisagree, subcommand("disagree")]
         | Annotated[FieldExport, subcommand("export")]

@@ -23,7 +23,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.quality import LevelOfDetail
 from rfcore.field.similarity import Similarity, moved
-from rfcore.image import Rgb
+from rfcore.image import Rgb, rgb_from_colour
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 
@@ -38,7 +38,6 @@ __all__ = [
     "in_drive_world",
     "known_conventions",
     "pairs_picture",
-    "to_rgb",
 ]
 
 UNITS = {"": 1.0, "centimetres": 100.0, "millimetres": 1000.0, "hundreds of metres": 0.01}
@@ -224,7 +223,7 @@ def pairs_picture(
     view = _FieldInDrive(field)
     rows, values_db = [], []
     for picture in _spread(pictures, PAIRS):
-        camera, render = picture.read(), to_rgb(view.colour(picture.camera, convention))
+        camera, render = picture.read(), rgb_from_colour(view.colour(picture.camera, convention))
         values_db.append(psnr(render, camera))
         rows.append(_shrunk(np.hstack([camera, render])))
     width = min(row.shape[1] for row in rows)
@@ -252,11 +251,6 @@ def in_drive_world(field: RadianceField, convention: Convention) -> SplatField:
     splats = moved(field.gaussians, world_from_field)
     fixed = SplatField(splats, field.metadata, levels=levels, isa=field.isa)
     return fixed.compressed() if "encoding" in field.archive().metadata else fixed
-
-
-def to_rgb(colour: F32) -> Rgb:
-    """Return display-referred colour as 8 bits, rounded to nearest."""
-    return np.asarray(np.floor(np.clip(colour, 0, 1) * 255 + 0.5), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -332,7 +326,7 @@ def _probed_error(view: _FieldInDrive, probes: Sequence[_Probe], convention: Con
 def _psnr_db(
     view: _FieldInDrive, pictures: Sequence[PosedPicture], convention: Convention
 ) -> float:
-    renders = [(to_rgb(view.colour(p.camera, convention)), p.read()) for p in pictures]
+    renders = [(rgb_from_colour(view.colour(p.camera, convention)), p.read()) for p in pictures]
     return float(np.mean([psnr(render, seen) for render, seen in renders]))
 
 

@@ -24,11 +24,10 @@ from rfcore.field.quality import DETAILS, kept_of
 from rfcore.field.splat_archive import splats_of_archive
 from rfcore.field.store import encode_field
 from rfcore.geodesy import Anchor
-from rfcore.image import I420, Rgb
+from rfcore.image import I420, Rgb, rgb_from_colour
 from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.views import PosedPicture
-from rfedge.fields.check import to_rgb
 from rfedge.timing import median_ms
 
 __all__ = [
@@ -197,7 +196,7 @@ def _mean_psnr_db(
 ) -> float:
     colours = [field.render_colour(picture.camera, quality) for picture in pictures]
     pairs = zip(colours, pictures, strict=True)
-    return float(np.mean([psnr(to_rgb(colour), seen.read()) for colour, seen in pairs]))
+    return float(np.mean([psnr(rgb_from_colour(colour), seen.read()) for colour, seen in pairs]))
 
 
 def _quality(psnr_db: float | None, ssim: float | None) -> str:

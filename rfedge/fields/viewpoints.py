@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, RadianceField, SplatField
-from rfcore.image import Rgb, write_png
+from rfcore.image import Rgb, rgb_from_colour, write_png
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
-from rfedge.fields.check import to_rgb
 
 __all__ = [
     "UPS",
@@ -149,7 +148,7 @@ def pictures_along(
 ) -> Iterator[tuple[Viewpoint, Rgb]]:
     """Yield what the field shows at each viewpoint."""
     for viewpoint in viewpoints:
-        yield viewpoint, to_rgb(field.render_colour(viewpoint.camera, quality))
+        yield viewpoint, rgb_from_colour(field.render_colour(viewpoint.camera, quality))
 
 
 def write_pictures(

@@ -19,7 +19,7 @@ from rfcore.camera import Camera, Pose
 from rfcore.extras import needs
 from rfcore.field import FULL, Renderer
 from rfcore.files import write_whole
-from rfcore.image import Rgb
+from rfcore.image import Rgb, rgb_from_colour
 from rfcore.localise.localiser import LocaliserSettings, Lost, Obstacle
 from rfcore.localise.matching import find_features, grey, lift_matches, match_features
 from rfedge.localisation.searches import SearchOutcome, SearchSummary, pose_difference
@@ -130,7 +130,7 @@ def _drawn(field: Renderer, attempt: SearchOutcome, pose: Pose) -> tuple[Rgb, in
     settings, k = LocaliserSettings(), attempt.picture.camera.intrinsics
     camera = Camera(k, pose)
     view = field.render(camera, FULL)
-    render = np.clip(view.colour * 255 + 0.5, 0, 255).astype(np.uint8)
+    render = rgb_from_colour(view.colour)
     rgb = attempt.picture.read()
     seen, drawn = (find_features(grey(picture), settings.features) for picture in (rgb, render))
     pairs = match_features(seen, drawn, settings.ratio)

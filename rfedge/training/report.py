@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from rfcore.dataset import Dataset
 from rfcore.field import RadianceField
 from rfcore.files import write_whole
-from rfcore.image import Rgb
+from rfcore.image import Rgb, rgb_from_colour
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 from rfedge.report.charts import DIFFERENCE_GAIN, amplified_difference, curve_chart, embedded
@@ -59,7 +59,8 @@ def _headline(result: Mapping[str, Any]) -> str:
 
 def _strips(field: RadianceField, held_out: Dataset) -> list[dict[str, Any]]:
     """Return the best, the median and the worst held-out picture."""
-    renders = [_render(field, picture) for picture in held_out.pictures]
+    colours = [field.render_colour(picture.camera) for picture in held_out.pictures]
+    renders = [rgb_from_colour(colour) for colour in colours]
     quality_db = [
         psnr(render, picture.read())
         for render, picture in zip(renders, held_out.pictures, strict=True)
@@ -69,11 +70,6 @@ def _strips(field: RadianceField, held_out: Dataset) -> list[dict[str, Any]]:
     return [
         _strip(which, held_out.pictures[i], renders[i], quality_db[i]) for which, i in shown.items()
     ]
-
-
-def _render(field: RadianceField, picture: PosedPicture) -> Rgb:
-    colour = np.clip(field.render_colour(picture.camera), 0.0, 1.0)
-    return np.asarray(np.floor(colour * 255 + 0.5), dtype=np.uint8)
 
 
 def _strip(which: str, picture: PosedPicture, render: Rgb, quality_db: float) -> dict[str, Any]:

@@ -30,7 +30,6 @@ from rfedge.cli.field import (
     FieldExport,
     FieldImport,
     FieldInfo,
-    FieldLevels,
     FieldSlim,
 )
 from rfedge.cli.render import Render
@@ -168,7 +167,7 @@ def test_a_field_is_slimmed_to_a_size_and_to_a_number_of_passes(
 @pytest.mark.parametrize(
     ("given", "problem"),
     [
-        ({}, "give either --keep, or"),
+        ({}, "give --keep, --max-mb or --passes; or --drive"),
         ({"keep": 50, "passes": 2}, "give either --keep, or"),
         ({"passes": 2}, "go with --drive"),
     ],
@@ -183,7 +182,7 @@ def test_a_size_has_one_goal_and_cameras(
 
 def test_levels_are_fitted_to_a_drives_cameras(here: Path, splats: Gaussians, drive: Path) -> None:
     save_field(SplatField(splats), here / "a.rff")
-    FieldLevels(here / "a.rff", drive, here / "b.rff", iterations=5).run()
+    FieldSlim(here / "a.rff", here / "b.rff", drive=drive, iterations=5).run()
     field = load_field(here / "b.rff")
     assert isinstance(field, SplatField)
     assert set(field.levels) == {0.5, 0.25, 0.1}

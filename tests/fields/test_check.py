@@ -9,6 +9,7 @@ from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldMetadata, SplatField
 from rfcore.field.similarity import Similarity, moved
+from rfcore.image import rgb_from_colour
 from rfcore.raster.gaussians import Gaussians
 from rfcore.views import PosedPicture
 from rfedge.fields.check import (
@@ -20,7 +21,6 @@ from rfedge.fields.check import (
     in_drive_world,
     known_conventions,
     pairs_picture,
-    to_rgb,
 )
 
 HALF = np.sqrt(0.5)
@@ -148,7 +148,7 @@ def tiny_splats(place, *, antialiased: bool) -> SplatField:
 
 
 def pictures_of(field: SplatField, pictures: list[PosedPicture]) -> list[PosedPicture]:
-    renders = [to_rgb(field.render_colour(picture.camera)) for picture in pictures]
+    renders = [rgb_from_colour(field.render_colour(picture.camera)) for picture in pictures]
     return [
         replace(picture, read=lambda rgb=rgb: rgb)
         for picture, rgb in zip(pictures, renders, strict=True)
