@@ -27,7 +27,7 @@ from streetgen.effects import EFFECTS, Effect, rng_of
 from streetgen.frame import LinearFrame
 from streetgen.geometry.layout import Geometry
 from streetgen.geometry.world import World
-from streetgen.scene_file import Drive, Rig, Scene
+from streetgen.scene_file import DriveSettings, RigSettings, Scene
 
 __all__ = [
     "EffectCost",
@@ -138,7 +138,7 @@ class Planner:
         self._cpu_s = cpu_s
         self._render = render
         self._worlds: dict[Geometry, World] = {}
-        self._plain_ms: dict[tuple[Geometry, Rig, Drive], float] = {}
+        self._plain_ms: dict[tuple[Geometry, RigSettings, DriveSettings], float] = {}
 
     def plan(self, scene: Scene) -> ScenePlan:
         """Run each declared effect and return what it took."""
@@ -222,7 +222,7 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> FrameMs:
     samples are not scaled.
     """
     from streetgen.render.backend import chosen_backend
-    from streetgen.render.renderer import Renderer, Sampling
+    from streetgen.render.renderer import PathTracer, Sampling
     from streetgen.shots import Split, shots_of
 
     shots = shots_of(scene, Split.DRIVE, SIZE_PX)[: FRAMES + 1]
@@ -231,7 +231,7 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> FrameMs:
     backend = chosen_backend()
 
     def frame_ms(world: World) -> float:
-        renderer = Renderer(world, Sampling(SAMPLES), backend, threads=1)
+        renderer = PathTracer(world, Sampling(SAMPLES), backend, threads=1)
         times_s = []
         for shot in shots:
             start_s = cpu_s()

@@ -27,14 +27,14 @@ from streetgen.effects import EFFECTS, EffectKind, load_effect
 from streetgen.geometry.layout import Geometry
 
 __all__ = [
-    "Drive",
-    "Evaluation",
+    "DriveSettings",
+    "EvaluationSettings",
     "LocalisationNoise",
     "OneOf",
-    "Rig",
+    "RigSettings",
     "Scene",
     "TomlFile",
-    "Training",
+    "TrainingSettings",
     "load_scene",
     "read_record",
 ]
@@ -133,7 +133,7 @@ Size = Annotated[tuple[int, int], Range(16, 8192)]
 
 
 @dataclass(frozen=True)
-class Rig:
+class RigSettings:
     """The cameras of the car that takes the training and evaluation views."""
 
     cameras: Annotated[int, Range(1, 18)] = 18
@@ -142,7 +142,7 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingSettings:
     """Views a field is trained on."""
 
     views: Annotated[int, Range(1, 100_000)] = 120
@@ -150,7 +150,7 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class EvaluationSettings:
     """``stations`` of the whole rig, none of them a training pose."""
 
     stations: Annotated[int, Range(1, 1000)] = 8
@@ -158,7 +158,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveSettings:
     """A camera that moves, rendered at ``rate_hz`` and thinned out to the lower rates."""
 
     duration_s: Annotated[float, Range(0.1, 600)] = 2.4
@@ -204,10 +204,10 @@ class Scene:
     name: str
     field: str
     geometry: Geometry = with_factory(default_factory=Geometry)
-    rig: Rig = Rig()
-    train: Training = Training()
-    evaluation: Evaluation = Evaluation()
-    drive: Drive = Drive()
+    rig: RigSettings = RigSettings()
+    train: TrainingSettings = TrainingSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+    drive: DriveSettings = DriveSettings()
     pose_noise: LocalisationNoise = LocalisationNoise()
     effects: Mapping[str, Any] = with_factory(default_factory=dict)
     passes: int = 0
@@ -215,10 +215,10 @@ class Scene:
 
 PARTS = {
     "geometry": Geometry,
-    "rig": Rig,
-    "train": Training,
-    "evaluation": Evaluation,
-    "drive": Drive,
+    "rig": RigSettings,
+    "train": TrainingSettings,
+    "evaluation": EvaluationSettings,
+    "drive": DriveSettings,
     "pose_noise": LocalisationNoise,
 }
 

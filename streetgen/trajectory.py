@@ -18,7 +18,7 @@ from rfcore.dataset.mounts import Mount
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from streetgen.geometry.layout import LANE_M
 from streetgen.geometry.mesh import F64
-from streetgen.scene_file import Drive, LocalisationNoise
+from streetgen.scene_file import DriveSettings, LocalisationNoise
 
 __all__ = [
     "CameraMotion",
@@ -78,19 +78,19 @@ def mounted(mount: Mount, place: F64, heading_rad: float) -> Pose:
     return looking(place + shift, float(yaw_rad), float(np.radians(mount.pitch_deg)))
 
 
-def drive_pose(drive: Drive, time_s: float) -> Pose:
+def drive_pose(drive: DriveSettings, time_s: float) -> Pose:
     """Return world_from_cam of the drive, centred on the street, with a car's sway."""
     place, yaw_rad = _car(drive, time_s)
     pitch = PITCH_RAD * np.sin(2 * np.pi * time_s / PITCH_PERIOD_S)
     return looking(place + np.array([0.0, 0.0, EYE_UP_M]), yaw_rad, float(pitch))
 
 
-def rig_pose(drive: Drive, mount: Mount, time_s: float) -> Pose:
+def rig_pose(drive: DriveSettings, mount: Mount, time_s: float) -> Pose:
     """Return world_from_cam of a camera on the car that takes the drive, which does not pitch."""
     return mounted(mount, *_car(drive, time_s))
 
 
-def _car(drive: Drive, time_s: float) -> tuple[F64, float]:
+def _car(drive: DriveSettings, time_s: float) -> tuple[F64, float]:
     """Return place on the road and heading of the car that takes the drive."""
     x_m = drive.speed_mps * (time_s - 0.5 * drive.duration_s)
     rate = 2 * np.pi / SWAY_PERIOD_S
@@ -102,12 +102,12 @@ def _car(drive: Drive, time_s: float) -> tuple[F64, float]:
     return place, float(yaw)
 
 
-def drive_motion(drive: Drive, time_s: float) -> CameraMotion:
+def drive_motion(drive: DriveSettings, time_s: float) -> CameraMotion:
     """Return the drive's velocity and turn rate by differences over 2 ms."""
     return _motion(partial(drive_pose, drive), time_s)
 
 
-def rig_motion(drive: Drive, mount: Mount, time_s: float) -> CameraMotion:
+def rig_motion(drive: DriveSettings, mount: Mount, time_s: float) -> CameraMotion:
     """Return those of a camera on the car that takes the drive."""
     return _motion(partial(rig_pose, drive, mount), time_s)
 

@@ -24,7 +24,7 @@ from streetgen.frame import LinearFrame, display_rgb
 from streetgen.geometry.mesh import Label, Mesh
 from streetgen.geometry.world import World
 from streetgen.render.backend import chosen_backend
-from streetgen.render.renderer import Renderer, Sampling
+from streetgen.render.renderer import PathTracer, Sampling
 from streetgen.scene_file import load_scene
 
 with needs("scene"):
@@ -97,7 +97,7 @@ class SceneTruth:
 
     def __init__(self, scene: str, threads: int = 2) -> None:
         self._world = world_of(load_scene(scene))
-        self._renderer = Renderer(self._world, Sampling(), chosen_backend(), threads)
+        self._renderer = PathTracer(self._world, Sampling(), chosen_backend(), threads)
 
     def picture(self, camera: Camera, time_s: float) -> Rgb:
         """Return the street as a camera there would see it, uint8 [H, W, 3]."""

@@ -26,7 +26,7 @@ from streetgen.assembly import apply_effects, world_of
 from streetgen.frame import LinearFrame, display_rgb
 from streetgen.geometry.mesh import F32, Label
 from streetgen.render.backend import Backend
-from streetgen.render.renderer import Renderer, Sampling
+from streetgen.render.renderer import PathTracer, Sampling
 from streetgen.scene_file import Scene
 from streetgen.shots import Shot, Split
 
@@ -163,7 +163,7 @@ class SceneRenderer:
     def __init__(self, job: RenderJob) -> None:
         self._job = job
         world = world_of(job.scene)
-        self._renderer = Renderer(world, job.sampling, job.backend, job.threads)
+        self._renderer = PathTracer(world, job.sampling, job.backend, job.threads)
 
     def take(self, shot: Shot) -> None:
         """Write a shot's files. Raises ``OSError``, and then has left none that is not whole."""

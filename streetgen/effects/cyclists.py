@@ -14,7 +14,7 @@ from streetgen.geometry.layout import Course
 from streetgen.geometry.mesh import F64
 from streetgen.geometry.person import BodyPart
 from streetgen.geometry.vehicle import world_from_vehicle
-from streetgen.geometry.world import Mover, Part, World
+from streetgen.geometry.world import Mover, StreetPart, World
 
 __all__ = ["Cyclists"]
 
@@ -45,7 +45,7 @@ class Cyclists:
                 Mover(meshes[part[0]], partial(_pose, looks, course, ahead_m, part))
                 for part in riding(looks, 0.0)
             ]
-        return world.plus(Part((), cyclist_materials(), tuple(movers)))
+        return world.plus(StreetPart((), cyclist_materials(), tuple(movers)))
 
 
 def _pose(looks: Cyclist, course: Course, ahead_m: float, part: BodyPart, time_s: float) -> F64:

@@ -8,11 +8,11 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from streetgen.geometry.layout import BAY_LENGTH_M, Layout, Place
+from streetgen.geometry.layout import BAY_LENGTH_M, GroundSpot, Layout
 from streetgen.geometry.mesh import Mesh
-from streetgen.geometry.vehicle import Vehicle, standing, vehicle
+from streetgen.geometry.vehicle import VehicleLooks, standing, vehicle
 from streetgen.geometry.vehicle_trim import vehicle_materials
-from streetgen.geometry.world import Part, World
+from streetgen.geometry.world import StreetPart, World
 
 __all__ = ["ParkedVehicles"]
 
@@ -42,21 +42,21 @@ class ParkedVehicles:
                 vehicle_in = self._drawn(today)
             if vehicle_in is not None and bay in world.layout.bays:
                 meshes += _parked(vehicle_in[0], bay, vehicle_in[1])
-        return world.plus(Part(tuple(meshes), vehicle_materials()))
+        return world.plus(StreetPart(tuple(meshes), vehicle_materials()))
 
-    def _drawn(self, rng: np.random.Generator) -> tuple[Vehicle, np.ndarray] | None:
+    def _drawn(self, rng: np.random.Generator) -> tuple[VehicleLooks, np.ndarray] | None:
         """A vehicle and how it deviates from its bay, or none."""
         looks, moved = _fitting(rng), rng.normal(0.0, (ALONG_M, ACROSS_M, TURN_RAD))
         return (looks, np.clip(moved, -0.3, 0.3)) if rng.random() < self.occupied else None
 
 
-def _fitting(rng: np.random.Generator) -> Vehicle:
-    looks = Vehicle.drawn(rng)
+def _fitting(rng: np.random.Generator) -> VehicleLooks:
+    looks = VehicleLooks.drawn(rng)
     while looks.length_m > BAY_LENGTH_M - GAP_M:
-        looks = Vehicle.drawn(rng)
+        looks = VehicleLooks.drawn(rng)
     return looks
 
 
-def _parked(looks: Vehicle, bay: Place, moved: np.ndarray) -> list[Mesh]:
+def _parked(looks: VehicleLooks, bay: GroundSpot, moved: np.ndarray) -> list[Mesh]:
     along, across, turn = moved.tolist()
     return standing(vehicle(looks), bay.x_m + along, bay.y_m + across, bay.heading_rad + turn)

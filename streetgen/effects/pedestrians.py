@@ -21,7 +21,7 @@ from streetgen.geometry.person import (
     walking,
 )
 from streetgen.geometry.vehicle import world_from_vehicle
-from streetgen.geometry.world import Mover, Part, World
+from streetgen.geometry.world import Mover, StreetPart, World
 
 __all__ = ["Pedestrians"]
 
@@ -60,7 +60,7 @@ class Pedestrians:
         for number, x_m in enumerate(self.crossing_m):
             way = partial(_crossing, x_m, (-1) ** (number + 1), half_m, self.speed_mps)
             movers += self._walker(way, rng)
-        return world.plus(Part((), person_materials(), tuple(movers)))
+        return world.plus(StreetPart((), person_materials(), tuple(movers)))
 
     def _walker(self, way: Way, rng: np.random.Generator) -> list[Mover]:
         looks, phase_rad = Person.drawn(rng), float(rng.uniform(0, 2 * np.pi))

@@ -11,9 +11,9 @@ import numpy as np
 from rfcore.tables import Range
 from streetgen.geometry.layout import LANE_M, Course
 from streetgen.geometry.mesh import F64
-from streetgen.geometry.vehicle import Vehicle, vehicle, world_from_vehicle
+from streetgen.geometry.vehicle import VehicleLooks, vehicle, world_from_vehicle
 from streetgen.geometry.vehicle_trim import vehicle_materials
-from streetgen.geometry.world import Mover, Part, World
+from streetgen.geometry.world import Mover, StreetPart, World
 
 __all__ = ["Traffic"]
 
@@ -34,10 +34,10 @@ class Traffic:
         """Return the world with the vehicles as movers."""
         ways = self.along_m, self.oncoming_m, self.speed_mps
         movers = tuple(
-            Mover(tuple(vehicle(Vehicle.drawn(rng))), partial(_pose, course))
+            Mover(tuple(vehicle(VehicleLooks.drawn(rng))), partial(_pose, course))
             for _, course in Course.both_ways(*ways, world.layout)
         )
-        return world.plus(Part((), vehicle_materials(), movers))
+        return world.plus(StreetPart((), vehicle_materials(), movers))
 
 
 def _pose(course: Course, time_s: float) -> F64:

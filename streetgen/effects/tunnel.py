@@ -12,12 +12,12 @@ import numpy as np
 
 from rfcore.tables import Range
 from streetgen.geometry.mesh import Label, Material
-from streetgen.geometry.solids import Stuff, boxes
-from streetgen.geometry.world import Part, World
+from streetgen.geometry.solids import Surface, boxes
+from streetgen.geometry.world import StreetPart, World
 
 __all__ = ["Tunnel"]
 
-CONCRETE = Stuff("tunnel", Label.BUILDING)
+CONCRETE = Surface("tunnel", Label.BUILDING)
 WALL_M = 0.4
 
 
@@ -37,4 +37,4 @@ class Tunnel:
         low = [(start, -outer, 0.0), (start, inner, 0.0), (start, -outer, top)]
         high = [(end, -inner, top), (end, outer, top), (end, outer, top + WALL_M)]
         material = Material(CONCRETE.material, (0.32, 0.31, 0.3))
-        return world.plus(Part((boxes(CONCRETE, low, high),), (material,)))
+        return world.plus(StreetPart((boxes(CONCRETE, low, high),), (material,)))

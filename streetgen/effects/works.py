@@ -12,10 +12,10 @@ import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfcore.tables import Range
-from streetgen.geometry.layout import KERB_M, ROAD_HALF_M, Closure, Place
+from streetgen.geometry.layout import KERB_M, ROAD_HALF_M, Closure, GroundSpot
 from streetgen.geometry.mesh import Label, Material, Mesh
-from streetgen.geometry.solids import Stuff, boxes, tube
-from streetgen.geometry.world import Part, World
+from streetgen.geometry.solids import Surface, boxes, tube
+from streetgen.geometry.world import StreetPart, World
 
 __all__ = ["Works"]
 
@@ -25,9 +25,9 @@ farther out in a wider street."""
 BOARD_M, BOARD_UP_M, BOARD_THICK_M = 2.0, 1.1, 0.04
 HEAP_M = 5.2
 CONTAINER_M = (6.06, 2.0, 2.59)
-BOARDS = (Stuff("board-red", Label.OBJECT), Stuff("board-white", Label.OBJECT))
-CONTAINER = Stuff("container", Label.OBJECT)
-GRAVEL = Stuff("gravel", Label.OBJECT)
+BOARDS = (Surface("board-red", Label.OBJECT), Surface("board-white", Label.OBJECT))
+CONTAINER = Surface("container", Label.OBJECT)
+GRAVEL = Surface("gravel", Label.OBJECT)
 MATERIALS = (
     Material("board-red", (0.55, 0.05, 0.04)),
     Material("board-white", (0.75, 0.75, 0.73)),
@@ -57,7 +57,7 @@ class Works:
         layout = replace(world.layout, closures=(*world.layout.closures, closed))
         wider_m = world.layout.geometry.wider_m
         meshes = [*_fence(closed, wider_m), *self._inside(closed, wider_m, rng)]
-        return replace(world, layout=layout).plus(Part(tuple(meshes), MATERIALS))
+        return replace(world, layout=layout).plus(StreetPart(tuple(meshes), MATERIALS))
 
     def _inside(self, closed: Closure, wider_m: float, rng: np.random.Generator) -> list[Mesh]:
         length, width, height = CONTAINER_M
@@ -71,7 +71,7 @@ class Works:
             x += length + 0.3
         if x + 2.4 < closed.end_m:
             y = closed.side * (HEAP_M + wider_m)
-            meshes.append(_heap(Place(x + 1.4, y, 0.0, closed.side, 0.0), rng))
+            meshes.append(_heap(GroundSpot(x + 1.4, y, 0.0, closed.side, 0.0), rng))
         return meshes
 
 
@@ -92,7 +92,7 @@ def _fence(closed: Closure, wider_m: float) -> list[Mesh]:
     return meshes
 
 
-def _heap(place: Place, rng: np.random.Generator) -> Mesh:
+def _heap(place: GroundSpot, rng: np.random.Generator) -> Mesh:
     """A cone of uneven slopes."""
     up = np.linspace(0.0, rng.uniform(1.0, 1.5), 6)
     path = np.stack([0 * up + place.x_m, 0 * up + place.y_m, up], axis=1)

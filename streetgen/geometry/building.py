@@ -14,8 +14,8 @@ from streetgen.geometry.facade import BuildingStyle, facade, rooms
 from streetgen.geometry.grain import enlarged, fractal, texture, tinted
 from streetgen.geometry.layout import BEYOND_M, Layout, Plot
 from streetgen.geometry.mesh import F32, F64, Colour, Label, Material, Mesh, Texture, placed
-from streetgen.geometry.solids import Stuff, boxes, quads
-from streetgen.geometry.world import Part
+from streetgen.geometry.solids import Surface, boxes, quads
+from streetgen.geometry.world import StreetPart
 
 __all__ = ["WALL_TILE_M", "bricks", "buildings", "plaster", "roof_tiles", "stone"]
 
@@ -92,26 +92,26 @@ PLASTERS = ((214, 198, 160), (178, 182, 184), (200, 150, 118), (170, 178, 158), 
 FRAMES = ((0.66, 0.65, 0.61), (0.10, 0.08, 0.06), (0.13, 0.17, 0.15))
 DOORS = ((0.16, 0.06, 0.03), (0.03, 0.09, 0.06), (0.05, 0.07, 0.16), (0.22, 0.04, 0.04))
 WALLS = len(BRICKS) + len(PLASTERS) + 1
-ROOF = Stuff("roof", Label.BUILDING, 2.0)
+ROOF = Surface("roof", Label.BUILDING, 2.0)
 HOUSE_DEPTH_M = 12.0
 
 
-def buildings(layout: Layout, rng: np.random.Generator) -> Part:
+def buildings(layout: Layout, rng: np.random.Generator) -> StreetPart:
     """Return all houses; the looks of each follow from its plot's style."""
     meshes = []
     for plot in layout.plots:
         meshes += _house(plot, plot.world_from_facade)
     for plot, world_from_facade in _across_the_ends(layout, rng):
         meshes += _house(plot, world_from_facade)
-    return Part(tuple(meshes), _materials(rng))
+    return StreetPart(tuple(meshes), _materials(rng))
 
 
 def _house(plot: Plot, world_from_facade: F64) -> list[Mesh]:
     rng = np.random.default_rng(plot.style)
     style = BuildingStyle(
-        wall=Stuff(f"wall{rng.integers(0, WALLS)}", Label.BUILDING, WALL_TILE_M),
-        frame=Stuff(f"frame{rng.integers(0, len(FRAMES))}", Label.BUILDING),
-        door=Stuff(f"door{rng.integers(0, len(DOORS))}", Label.BUILDING),
+        wall=Surface(f"wall{rng.integers(0, WALLS)}", Label.BUILDING, WALL_TILE_M),
+        frame=Surface(f"frame{rng.integers(0, len(FRAMES))}", Label.BUILDING),
+        door=Surface(f"door{rng.integers(0, len(DOORS))}", Label.BUILDING),
     )
     meshes = [*facade(plot, style, rng), *_shell(plot, style), *_roof(plot, rng)]
     return [placed(mesh, world_from_facade) for mesh in meshes]
@@ -142,7 +142,7 @@ def _roof(plot: Plot, rng: np.random.Generator) -> list[Mesh]:
     uv = [[(0, slope), (w / ROOF.tile_m, slope), (w / ROOF.tile_m, 0), (0, 0)]] * 2
     across = rng.uniform(1.0, w - 1.6)
     chimney = boxes(
-        Stuff("wall0", Label.BUILDING, WALL_TILE_M),
+        Surface("wall0", Label.BUILDING, WALL_TILE_M),
         (across, h + 1.0, -d / 2 + 0.8),
         (across + 0.6, h + 4.2, -d / 2 + 1.5),
     )

@@ -33,7 +33,7 @@ from streetgen.geometry.person import (
     hung,
     person_materials,
 )
-from streetgen.geometry.solids import Stuff, boxes, disc, loft, tube
+from streetgen.geometry.solids import Surface, boxes, disc, loft, tube
 from streetgen.geometry.vehicle import revolved
 
 __all__ = ["WHEEL_RADIUS_M", "Cyclist", "cyclist_materials", "cyclist_parts", "riding"]
@@ -64,8 +64,8 @@ PAINTS = {
     "bicycle green": (0.03, 0.14, 0.07),
     "bicycle silver": (0.44, 0.45, 0.46),
 }
-RUBBER = Stuff("bicycle rubber", Label.BICYCLE)
-METAL = Stuff("bicycle metal", Label.BICYCLE)
+RUBBER = Surface("bicycle rubber", Label.BICYCLE)
+METAL = Surface("bicycle metal", Label.BICYCLE)
 MATERIALS = (
     *(Material(name, colour, gloss=True) for name, colour in PAINTS.items()),
     Material("bicycle rubber", (0.02, 0.02, 0.02)),
@@ -203,7 +203,7 @@ def cyclist_parts(looks: Cyclist) -> dict[str, tuple[Mesh, ...]]:
 
 def _frame(looks: Cyclist) -> list[Mesh]:
     """The tubes, saddle and handlebars."""
-    paint = Stuff(looks.paint, Label.BICYCLE)
+    paint = Surface(looks.paint, Label.BICYCLE)
     hip, grip = looks.hip_m, _grip_m(looks)
     saddle = hip[0], hip[1] - 0.055 * looks.rider.height_m
     cluster = BRACKET_M[0] + 0.5 * SEAT_TUBE[0], BRACKET_M[1] + 0.5 * SEAT_TUBE[1]
@@ -220,9 +220,9 @@ def _frame(looks: Cyclist) -> list[Mesh]:
     return [*found, _saddle(saddle)]
 
 
-def _tube(stuff: Stuff, start: Point, end: Point, radius_m: float, y_m: float = 0.0) -> Mesh:
+def _tube(surface: Surface, start: Point, end: Point, radius_m: float, y_m: float = 0.0) -> Mesh:
     path = [(start[0], y_m, start[1]), (end[0], y_m, end[1])]
-    return tube(stuff, path, radius_m, 8)
+    return tube(surface, path, radius_m, 8)
 
 
 def _saddle(top_m: Point) -> Mesh:

@@ -14,7 +14,7 @@ import numpy as np
 from streetgen.geometry.grain import texture
 from streetgen.geometry.layout import Plot
 from streetgen.geometry.mesh import F32, F64, Label, Mesh, Texture
-from streetgen.geometry.solids import Stuff, boxes, quads, tube
+from streetgen.geometry.solids import Surface, boxes, quads, tube
 
 __all__ = [
     "ROOMS",
@@ -76,7 +76,7 @@ def _lower_blind(room: F32, rng: np.random.Generator) -> None:
     room[:height] = slats[:, None, None] * np.array((118, 116, 110), np.float32)
 
 
-GLASS = Stuff("glass", Label.WINDOW)
+GLASS = Surface("glass", Label.WINDOW)
 FRAME_M = 0.05
 
 
@@ -93,10 +93,10 @@ def wall_around(width_m: float, low_m: float, high_m: float, openings: F64) -> F
     return np.asarray(every[(every[:, 2] > every[:, 0]) & (every[:, 3] > every[:, 1])])
 
 
-def upright(stuff: Stuff, areas: F64, out_m: float = 0.0) -> Mesh:
+def upright(surface: Surface, areas: F64, out_m: float = 0.0) -> Mesh:
     """Return rectangles [N, 4] that look out of the wall, ``out_m`` before it."""
     corners = _corners(areas, out_m)
-    return quads(stuff, corners, corners[..., :2] * (1, -1) / stuff.tile_m)
+    return quads(surface, corners, corners[..., :2] * (1, -1) / surface.tile_m)
 
 
 def panes(openings: F64, depth_m: float, rng: np.random.Generator) -> Mesh:
@@ -104,7 +104,7 @@ def panes(openings: F64, depth_m: float, rng: np.random.Generator) -> Mesh:
     return quads(GLASS, _corners(openings, -depth_m), room_uv(rng, len(openings)))
 
 
-def reveals(stuff: Stuff, openings: F64, depth_m: float) -> Mesh:
+def reveals(surface: Surface, openings: F64, depth_m: float) -> Mesh:
     """Return the four inner sides of each opening."""
     front, back = _corners(openings, 0.0), _corners(openings, -depth_m)
     sides = [
@@ -112,11 +112,11 @@ def reveals(stuff: Stuff, openings: F64, depth_m: float) -> Mesh:
         for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))
     ]
     corners = np.concatenate(sides)
-    uv = np.stack([corners[..., 0] + corners[..., 2], -corners[..., 1]], axis=2) / stuff.tile_m
-    return quads(stuff, corners, uv)
+    uv = np.stack([corners[..., 0] + corners[..., 2], -corners[..., 1]], axis=2) / surface.tile_m
+    return quads(surface, corners, uv)
 
 
-def frames(stuff: Stuff, openings: F64, depth_m: float, bars: tuple[int, int]) -> Mesh:
+def frames(surface: Surface, openings: F64, depth_m: float, bars: tuple[int, int]) -> Mesh:
     """Return a frame in each opening with so many bars across u and across v."""
     u0, v0, u1, v1 = openings.T
     t = FRAME_M
@@ -129,20 +129,20 @@ def frames(stuff: Stuff, openings: F64, depth_m: float, bars: tuple[int, int]) -
         v = v0 + (v1 - v0) * (0.68 if bars[1] == 1 else i / (bars[1] + 1))
         parts.append((u0 + t, v - 0.02, u1 - t, v + 0.02))
     areas = np.concatenate([np.stack(part, axis=1) for part in parts])
-    return _slab(stuff, areas, -depth_m, -depth_m + 0.05)
+    return _slab(surface, areas, -depth_m, -depth_m + 0.05)
 
 
-def sills(stuff: Stuff, openings: F64) -> Mesh:
+def sills(surface: Surface, openings: F64) -> Mesh:
     """Return a sill under each opening."""
     u0, v0, u1, _ = openings.T
-    return _slab(stuff, np.stack([u0 - 0.08, v0 - 0.09, u1 + 0.08, v0], axis=1), -0.02, 0.09)
+    return _slab(surface, np.stack([u0 - 0.08, v0 - 0.09, u1 + 0.08, v0], axis=1), -0.02, 0.09)
 
 
-def _slab(stuff: Stuff, areas: F64, near_m: float, far_m: float) -> Mesh:
+def _slab(surface: Surface, areas: F64, near_m: float, far_m: float) -> Mesh:
     u0, v0, u1, v1 = areas.T
     ones = np.ones_like(u0)
     return boxes(
-        stuff,
+        surface,
         np.stack([u0, v0, near_m * ones], axis=1),
         np.stack([u1, v1, far_m * ones], axis=1),
     )
@@ -156,17 +156,17 @@ def _corners(areas: F64, out_m: float) -> F64:
 
 
 DEPTH_M = 0.18
-STONE = Stuff("trim", Label.BUILDING)
-METAL = Stuff("metal", Label.BUILDING)
+STONE = Surface("trim", Label.BUILDING)
+METAL = Surface("metal", Label.BUILDING)
 
 
 @dataclass(frozen=True)
 class BuildingStyle:
     """What a building is made of."""
 
-    wall: Stuff
-    frame: Stuff
-    door: Stuff
+    wall: Surface
+    frame: Surface
+    door: Surface
 
 
 def facade(plot: Plot, style: BuildingStyle, rng: np.random.Generator) -> list[Mesh]:

@@ -11,19 +11,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from streetgen.geometry.layout import PAVEMENT_UP_M, SIDES, Layout, Place
+from streetgen.geometry.layout import PAVEMENT_UP_M, SIDES, GroundSpot, Layout
 from streetgen.geometry.mesh import F32, F64, Label, Material, Mesh, placed
 from streetgen.geometry.signage import FACES, NAMES, ROUND, face_uv, name_uv, sign_materials
-from streetgen.geometry.solids import Stuff, boxes, disc, quads, tube
-from streetgen.geometry.world import Part
+from streetgen.geometry.solids import Surface, boxes, disc, quads, tube
+from streetgen.geometry.world import StreetPart
 
 __all__ = ["lamps", "post_of", "railings", "signs", "traffic_light", "wires"]
 
 
-LAMP_POST = Stuff("post", Label.POLE)
-SHADE = Stuff("shade", Label.POLE)
-WIRE = Stuff("wire", Label.WIRE)
-RAIL = Stuff("rail", Label.POLE)
+LAMP_POST = Surface("post", Label.POLE)
+SHADE = Surface("shade", Label.POLE)
+WIRE = Surface("wire", Label.WIRE)
+RAIL = Surface("rail", Label.POLE)
 POST_PAINT = Material("post", (0.05, 0.055, 0.055), roughness=0.4, metallic=0.3)
 POST_UP_M = 7.0
 WIRE_RADIUS_M = 0.011
@@ -34,13 +34,13 @@ RAIL_M = 7.05
 """From the middle of the road to railings and bollards."""
 
 
-def lamps(layout: Layout, _rng: np.random.Generator) -> Part:
+def lamps(layout: Layout, _rng: np.random.Generator) -> StreetPart:
     """Return posts, each with an arm over the road and a lamp at its end."""
     meshes = [mesh for place in layout.lamps for mesh in _lamp(place)]
-    return Part(tuple(meshes), (POST_PAINT, Material("shade", (0.8, 0.8, 0.78), gloss=True)))
+    return StreetPart(tuple(meshes), (POST_PAINT, Material("shade", (0.8, 0.8, 0.78), gloss=True)))
 
 
-def wires(layout: Layout, _rng: np.random.Generator) -> Part:
+def wires(layout: Layout, _rng: np.random.Generator) -> StreetPart:
     """Return two wires along each row of lamps, spans across every 48 m, and two over the lanes."""
     meshes: list[Mesh] = []
     for side in SIDES:
@@ -59,10 +59,10 @@ def wires(layout: Layout, _rng: np.random.Generator) -> Part:
     for y_m in (1.9, -1.9):
         sway = 0.2 * np.cos(along / 48.0 * 2 * np.pi)
         meshes.append(_wire(along, y_m, SPAN_UP_M - 0.1 + sway))
-    return Part(tuple(meshes), (Material("wire", (0.02, 0.02, 0.02)),))
+    return StreetPart(tuple(meshes), (Material("wire", (0.02, 0.02, 0.02)),))
 
 
-def railings(layout: Layout, rng: np.random.Generator) -> Part:
+def railings(layout: Layout, rng: np.random.Generator) -> StreetPart:
     """Return a railing of thin bars by each crossing and a row of bollards after it."""
     meshes: list[Mesh] = []
     for crossing in layout.crossings_x_m:
@@ -71,10 +71,10 @@ def railings(layout: Layout, rng: np.random.Generator) -> Part:
             meshes += _railing(crossing + 2.5 + rng.uniform(0, 0.5), y)
             meshes += _bollards(crossing - 10.0, y)
     rail = Material("rail", (0.5, 0.51, 0.52), roughness=0.35, metallic=0.9)
-    return Part(tuple(meshes), (rail, POST_PAINT))
+    return StreetPart(tuple(meshes), (rail, POST_PAINT))
 
 
-def _lamp(place: Place) -> list[Mesh]:
+def _lamp(place: GroundSpot) -> list[Mesh]:
     x, y, side = place.x_m, place.y_m, place.side
     foot = tube(
         LAMP_POST,
@@ -119,11 +119,11 @@ def _bollards(start: float, y: float) -> list[Mesh]:
     return meshes
 
 
-SIGN_POST = Stuff("sign post", Label.POLE)
-SIGN_BACK = Stuff("sign back", Label.SIGN)
-FACE = Stuff("sign face", Label.SIGN)
-NAME = Stuff("street name", Label.SIGN)
-CASE = Stuff("signal case", Label.SIGN)
+SIGN_POST = Surface("sign post", Label.POLE)
+SIGN_BACK = Surface("sign back", Label.SIGN)
+FACE = Surface("sign face", Label.SIGN)
+NAME = Surface("street name", Label.SIGN)
+CASE = Surface("signal case", Label.SIGN)
 UNDER_M = 0.3
 """Posts begin so far under the pavement."""
 FACE_M = 0.60
@@ -136,7 +136,7 @@ BOARD_M = np.array([0.012, 0.11, 0.14])
 LENSES = ("signal red", "signal amber", "signal green")
 
 
-def signs(layout: Layout, rng: np.random.Generator) -> Part:
+def signs(layout: Layout, rng: np.random.Generator) -> StreetPart:
     """Return a sign at each of the layout's signposts, and lights at its crossings."""
     meshes: list[Mesh] = []
     for number, place in enumerate(layout.signposts):
@@ -147,12 +147,12 @@ def signs(layout: Layout, rng: np.random.Generator) -> Part:
         for side in SIDES:
             at = crossing + side * LIGHT_OFFSET_M
             heading = 0.0 if side > 0 else np.pi
-            place = Place(
+            place = GroundSpot(
                 at, side * (LIGHT_M + layout.geometry.wider_m), PAVEMENT_UP_M, side, heading
             )
             green = int(rng.integers(2)) * 2
             meshes += [placed(mesh, _facing(place)) for mesh in traffic_light(green)]
-    return Part(tuple(meshes), sign_materials())
+    return StreetPart(tuple(meshes), sign_materials())
 
 
 def post_of(face: int, name: int) -> list[Mesh]:
@@ -191,7 +191,7 @@ def _post(top_m: float, radius_m: float) -> Mesh:
     return tube(SIGN_POST, [(0, 0, -UNDER_M), (0, 0, 1.0), (0, 0, top_m)], radius_m, 10)
 
 
-def _panel(size_m: tuple[float, float], centre_m: float, front: Stuff, uv: F32) -> list[Mesh]:
+def _panel(size_m: tuple[float, float], centre_m: float, front: Surface, uv: F32) -> list[Mesh]:
     """A sheet of metal clamped to the post, its picture towards x."""
     half_w, half_h = 0.5 * size_m[0], 0.5 * size_m[1]
     low, high = (0.036, -half_w, centre_m - half_h), (0.05, half_w, centre_m + half_h)
@@ -223,7 +223,7 @@ def _lamp_case(centre: F64, lit: int) -> list[Mesh]:
     ]
     for number, name in enumerate(LENSES):
         middle = centre + np.array([0.065, 0.0, 0.29 * (1 - number)])
-        lens = Stuff(name if number == lit else f"{name} off", Label.SIGN)
+        lens = Surface(name if number == lit else f"{name} off", Label.SIGN)
         meshes.append(disc(lens, middle, (1, 0, 0), LENS_RADIUS_M, 20))
         meshes.append(_hood(middle))
     return meshes
@@ -239,7 +239,7 @@ def _hood(middle: F64) -> Mesh:
     return quads(CASE, np.array(strips))
 
 
-def _facing(place: Place) -> F64:
+def _facing(place: GroundSpot) -> F64:
     """The sign's x axis towards the place's heading; its arm (-y) reaches over the road."""
     cos, sin = np.cos(place.heading_rad), np.sin(place.heading_rad)
     x, y, z = place.x_m, place.y_m, place.z_m

@@ -32,8 +32,8 @@ __all__ = [
     "Closure",
     "Course",
     "Geometry",
+    "GroundSpot",
     "Layout",
-    "Place",
     "Plot",
 ]
 
@@ -79,7 +79,7 @@ class Geometry:
 
 
 @dataclass(frozen=True)
-class Place:
+class GroundSpot:
     """A spot on the ground: ``side`` of the road, and the heading (rad, from x towards y)."""
 
     x_m: float
@@ -209,12 +209,12 @@ class Layout:
         return tuple(np.arange(first, self.end_m - 5.0, CROSSING_SPACING_M).tolist())
 
     @cached_property
-    def lamps(self) -> tuple[Place, ...]:
+    def lamps(self) -> tuple[GroundSpot, ...]:
         """The feet of the lamp posts, staggered; they look towards the road."""
         return self._along(LAMP_M, 8.0, self.geometry.lamp_spacing_m, stagger_m=12.0)
 
     @cached_property
-    def trees(self) -> tuple[Place, ...]:
+    def trees(self) -> tuple[GroundSpot, ...]:
         """Where trees may stand: off lamps and crossings; the headings are by chance."""
         rng = np.random.default_rng([self.geometry.seed, 2])
         taken = [(lamp.x_m, lamp.side) for lamp in self.lamps]
@@ -224,28 +224,28 @@ class Layout:
             x_m = place.x_m + moved_m
             free = all(abs(x_m - x) > 2.0 for x, side in taken if side == place.side)
             if chance < 0.8 and free and not self.at_crossing(x_m, 3.0):
-                kept.append(Place(x_m, place.y_m, place.z_m, place.side, heading_rad))
+                kept.append(GroundSpot(x_m, place.y_m, place.z_m, place.side, heading_rad))
         return tuple(kept)
 
     @cached_property
-    def signposts(self) -> tuple[Place, ...]:
+    def signposts(self) -> tuple[GroundSpot, ...]:
         """Feet of traffic signs; the headings look at who drives towards them."""
         found = self._along(SIGN_M, 15.0, SIGN_SPACING_M, stagger_m=9.0)
         return tuple(
-            Place(p.x_m, p.y_m, p.z_m, p.side, 0.0 if p.side > 0 else np.pi) for p in found
+            GroundSpot(p.x_m, p.y_m, p.z_m, p.side, 0.0 if p.side > 0 else np.pi) for p in found
         )
 
     @cached_property
-    def bays(self) -> tuple[Place, ...]:
+    def bays(self) -> tuple[GroundSpot, ...]:
         """Middles of the open parking bays, off the crossings; headings along the traffic."""
         found = self._along(BAY_M, 5.0, BAY_LENGTH_M, stagger_m=0.0)
         return tuple(
-            Place(p.x_m, p.y_m, 0.0, p.side, np.pi if p.side > 0 else 0.0)
+            GroundSpot(p.x_m, p.y_m, 0.0, p.side, np.pi if p.side > 0 else 0.0)
             for p in found
             if not self.at_crossing(p.x_m, 5.0) and not self._closed(p)
         )
 
-    def _closed(self, bay: Place) -> bool:
+    def _closed(self, bay: GroundSpot) -> bool:
         reach_m = 0.5 * BAY_LENGTH_M
         return any(
             c.side == bay.side and c.start_m - reach_m < bay.x_m < c.end_m + reach_m
@@ -259,11 +259,11 @@ class Layout:
 
     def _along(
         self, y_m: float, first_m: float, spacing_m: float, stagger_m: float
-    ) -> tuple[Place, ...]:
+    ) -> tuple[GroundSpot, ...]:
         """Places on both sides; ``y_m`` is that of a street that is not wider."""
         y_m += self.geometry.wider_m
         return tuple(
-            Place(float(x), side * y_m, PAVEMENT_UP_M, side, -0.5 * np.pi * side)
+            GroundSpot(float(x), side * y_m, PAVEMENT_UP_M, side, -0.5 * np.pi * side)
             for side in SIDES
             for x in np.arange(
                 self.start_m + first_m + (stagger_m if side < 0 else 0.0), self.end_m, spacing_m

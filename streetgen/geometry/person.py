@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from streetgen.geometry.mesh import F64, Colour, Label, Material, Mesh, joined, placed
-from streetgen.geometry.solids import Stuff, loft
+from streetgen.geometry.solids import Surface, loft
 
 __all__ = [
     "ANKLE",
@@ -140,7 +140,7 @@ def body_parts(looks: Person) -> dict[str, tuple[Mesh, ...]]:
     The ``trunk`` begins at the middle of the hips, the ``head`` at the neck's foot.
     """
     coat, trousers, skin, hair, shoes = (
-        Stuff(name, Label.PERSON)
+        Surface(name, Label.PERSON)
         for name in (looks.coat, looks.trousers, looks.skin, looks.hair, "shoes")
     )
     shares = {
@@ -162,7 +162,7 @@ def body_parts(looks: Person) -> dict[str, tuple[Mesh, ...]]:
     }
 
 
-def _head(skin: Stuff, hair: Stuff) -> list[Mesh]:
+def _head(skin: Surface, hair: Surface) -> list[Mesh]:
     """The neck, the head over it, and hair over its crown and back."""
     neck = np.array(NECK) - (NECK_FOOT, 0.0, 0.0, 0.0)
     return [
@@ -172,7 +172,7 @@ def _head(skin: Stuff, hair: Stuff) -> list[Mesh]:
     ]
 
 
-def _limb(stuff: Stuff, length: float, radius: float, end_radius: float) -> Mesh:
+def _limb(surface: Surface, length: float, radius: float, end_radius: float) -> Mesh:
     """A cone from the joint down, with round ends about the joint and the next one."""
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 9)
     low, high = turn[:5], turn[4:]
@@ -180,16 +180,16 @@ def _limb(stuff: Stuff, length: float, radius: float, end_radius: float) -> Mesh
     radii = [end_radius * np.cos(low), radius * np.cos(high)]
     z, r = (np.concatenate(values) for values in (heights, radii))
     r = np.maximum(r, POINT)
-    return loft(stuff, np.stack([z, 0 * z, r, r], axis=1))
+    return loft(surface, np.stack([z, 0 * z, r, r], axis=1))
 
 
-def _ball(stuff: Stuff, middle: tuple[float, float], radii: tuple[float, float, float]) -> Mesh:
+def _ball(surface: Surface, middle: tuple[float, float], radii: tuple[float, float, float]) -> Mesh:
     """An ellipsoid about (x, z) with radii along x, y and z."""
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 11)
     wide = np.maximum(np.cos(turn), 1e-3)
     (x, z), (rx, ry, rz) = middle, radii
     return loft(
-        stuff, np.stack([z + rz * np.sin(turn), x + 0 * turn, rx * wide, ry * wide], axis=1)
+        surface, np.stack([z + rz * np.sin(turn), x + 0 * turn, rx * wide, ry * wide], axis=1)
     )
 
 

@@ -19,8 +19,8 @@ from streetgen.geometry.layout import (
     Layout,
 )
 from streetgen.geometry.mesh import F32, F64, Label, Material, Mesh, Texture
-from streetgen.geometry.solids import Stuff, boxes, disc, quads
-from streetgen.geometry.world import Part
+from streetgen.geometry.solids import Surface, boxes, disc, quads
+from streetgen.geometry.world import StreetPart
 
 __all__ = ["ASPHALT_TILE_M", "SLAB_TILE_M", "asphalt", "paint", "road", "slabs"]
 
@@ -90,18 +90,18 @@ def _wander(rng: np.random.Generator, side_px: int, steps: int, step_px: float) 
     return np.asarray(rng.uniform(0, side_px, 2) + np.cumsum(moves, axis=0)).astype(np.int32)
 
 
-ASPHALT = Stuff("asphalt", Label.ROAD, ASPHALT_TILE_M)
-SLABS = Stuff("slabs", Label.PAVEMENT, SLAB_TILE_M)
-KERB = Stuff("kerb", Label.PAVEMENT)
-PAINT = Stuff("paint", Label.MARKING, 2.0)
-IRON = Stuff("iron", Label.ROAD)
+ASPHALT = Surface("asphalt", Label.ROAD, ASPHALT_TILE_M)
+SLABS = Surface("slabs", Label.PAVEMENT, SLAB_TILE_M)
+KERB = Surface("kerb", Label.PAVEMENT)
+PAINT = Surface("paint", Label.MARKING, 2.0)
+IRON = Surface("iron", Label.ROAD)
 BAY_LINE_M, ZEBRA_HALF_M = 4.2, 6.0
 PAINT_UP_M = 0.004
 """Markings lie this much above the road, less than any depth map resolves at 10 m."""
 PAVEMENT_TO_M = 30.0
 
 
-def road(layout: Layout, rng: np.random.Generator) -> Part:
+def road(layout: Layout, rng: np.random.Generator) -> StreetPart:
     """Return the ground of the street."""
     start, end = layout.start_m - BEYOND_M, layout.end_m + BEYOND_M
     half = layout.road_half_m
@@ -109,7 +109,7 @@ def road(layout: Layout, rng: np.random.Generator) -> Part:
     meshes += [mesh for side in SIDES for mesh in _edge(side, start, end, half)]
     meshes += _markings(layout)
     meshes += _manholes(layout, rng)
-    return Part(
+    return StreetPart(
         tuple(meshes),
         (
             Material("asphalt", asphalt(rng), roughness=0.8),
@@ -173,12 +173,12 @@ def _strips(start: F64, length: float, low: float, high: float) -> F64:
     return np.stack([start, low * ones, start + length, high * ones], axis=1)
 
 
-def _flat(stuff: Stuff, areas: F64, z_m: float) -> Mesh:
+def _flat(surface: Surface, areas: F64, z_m: float) -> Mesh:
     """Rectangles (x0, y0, x1, y1) [N, 4] that look up; their texture lies on the ground."""
     x0, y0, x1, y1 = areas.T
     corners = np.stack(
         [np.stack([x, y], axis=1) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1
     )
     up = np.full((*corners.shape[:2], 1), z_m)
-    uv = corners * (1, -1) / stuff.tile_m
-    return quads(stuff, np.concatenate([corners, up], axis=2), uv)
+    uv = corners * (1, -1) / surface.tile_m
+    return quads(surface, np.concatenate([corners, up], axis=2), uv)

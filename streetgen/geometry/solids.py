@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from rfcore.errors import InvalidInput
 from streetgen.geometry.mesh import F32, I32, Label, Mesh
 
-__all__ = ["Stuff", "boxes", "disc", "loft", "quads", "tube"]
+__all__ = ["Surface", "boxes", "disc", "loft", "quads", "tube"]
 
 BOX_SIDES = np.array(
     [
@@ -34,7 +34,7 @@ WHOLE_TEXTURE = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
 
 
 @dataclass(frozen=True)
-class Stuff:
+class Surface:
     """What a body is made of and what it counts as; ``tile_m`` is the side of its texture."""
 
     material: str
@@ -42,7 +42,7 @@ class Stuff:
     tile_m: float = 4.0
 
 
-def quads(stuff: Stuff, corners: ArrayLike, uv: ArrayLike | None = None) -> Mesh:
+def quads(surface: Surface, corners: ArrayLike, uv: ArrayLike | None = None) -> Mesh:
     """Return rectangles from corners [N, 4, 3], anticlockwise from the lower left.
 
     ``uv`` [N, 4, 2]; without it each shows its whole texture.
@@ -57,21 +57,23 @@ def quads(stuff: Stuff, corners: ArrayLike, uv: ArrayLike | None = None) -> Mesh
         vertices=points.reshape(-1, 3),
         faces=(first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)).reshape(-1, 3),
         uv=np.ascontiguousarray(texture.reshape(-1, 2)),
-        material=stuff.material,
-        label=stuff.label,
+        material=surface.material,
+        label=surface.label,
     )
 
 
-def boxes(stuff: Stuff, low: ArrayLike, high: ArrayLike) -> Mesh:
+def boxes(surface: Surface, low: ArrayLike, high: ArrayLike) -> Mesh:
     """Return closed boxes between the corners ``low`` and ``high``, [3] or [N, 3]."""
     lows, highs = np.broadcast_arrays(np.atleast_2d(low), np.atleast_2d(high))
     ends = np.stack([lows, highs], axis=1).astype(np.float32)
     corners = np.stack([ends[:, BOX_SIDES[..., axis], axis] for axis in range(3)], axis=-1)
-    uv = np.take_along_axis(corners, BOX_AXES[None, :, None, :], axis=3) / np.float32(stuff.tile_m)
-    return quads(stuff, corners, uv * np.array([1, -1], np.float32))
+    uv = np.take_along_axis(corners, BOX_AXES[None, :, None, :], axis=3) / np.float32(
+        surface.tile_m
+    )
+    return quads(surface, corners, uv * np.array([1, -1], np.float32))
 
 
-def tube(stuff: Stuff, path: ArrayLike, radius_m: ArrayLike, sides: int = 10) -> Mesh:
+def tube(surface: Surface, path: ArrayLike, radius_m: ArrayLike, sides: int = 10) -> Mesh:
     """Return an open tube around a path [N, 3] with one radius or one for each of its points."""
     points = np.asarray(path, np.float64)
     radii = np.broadcast_to(np.asarray(radius_m, np.float64), len(points))
@@ -81,19 +83,19 @@ def tube(stuff: Stuff, path: ArrayLike, radius_m: ArrayLike, sides: int = 10) ->
         across[:, None] * np.cos(turn)[None, :, None] + over[:, None] * np.sin(turn)[None, :, None]
     )
     steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps_m)]) / stuff.tile_m
+    along = np.concatenate([[0.0], np.cumsum(steps_m)]) / surface.tile_m
     uv = np.stack(np.broadcast_arrays(turn[None] / (2 * np.pi), along[:, None]), axis=-1)
     return Mesh(
         vertices=_flat(points[:, None] + normals * radii[:, None, None], 3),
         faces=_grid_faces(len(points), sides + 1),
         uv=_flat(uv, 2),
-        material=stuff.material,
-        label=stuff.label,
+        material=surface.material,
+        label=surface.label,
         normals=_flat(normals, 3),
     )
 
 
-def loft(stuff: Stuff, sections: ArrayLike, sides: int = 12) -> Mesh:
+def loft(surface: Surface, sections: ArrayLike, sides: int = 12) -> Mesh:
     """Return a smooth body of level elliptical sections [N, 4], from the lowest to the highest.
 
     A section is (height, middle along x, half width along x, half width along y); the body is open
@@ -112,14 +114,14 @@ def loft(stuff: Stuff, sections: ArrayLike, sides: int = 12) -> Mesh:
     normals = np.cross(round_, up)
     normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
     uv = np.stack(
-        np.broadcast_arrays(turn[None] / (2 * np.pi), rings[:, :1] / stuff.tile_m), axis=-1
+        np.broadcast_arrays(turn[None] / (2 * np.pi), rings[:, :1] / surface.tile_m), axis=-1
     )
     return Mesh(
         vertices=_flat(points, 3),
         faces=_grid_faces(len(rings), sides + 1),
         uv=_flat(uv, 2),
-        material=stuff.material,
-        label=stuff.label,
+        material=surface.material,
+        label=surface.label,
         normals=_flat(normals, 3),
     )
 
@@ -132,7 +134,7 @@ def _ellipses(rings: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def disc(
-    stuff: Stuff, centre: ArrayLike, towards: ArrayLike, radius_m: float, sides: int = 24
+    surface: Surface, centre: ArrayLike, towards: ArrayLike, radius_m: float, sides: int = 24
 ) -> Mesh:
     """Return a disc that faces ``towards``; its texture is the picture it is cut from."""
     middle = np.asarray(centre, np.float64)
@@ -146,8 +148,8 @@ def disc(
         vertices=_flat(np.concatenate([middle[None], middle + radius_m * ring]), 3),
         faces=np.stack([np.zeros_like(i), 1 + i, 1 + (i + 1) % sides], axis=1).astype(np.int32),
         uv=_flat(np.concatenate([[[0.5, 0.5]], picture]), 2),
-        material=stuff.material,
-        label=stuff.label,
+        material=surface.material,
+        label=surface.label,
     )
 
 

@@ -13,12 +13,12 @@ from functools import lru_cache
 import numpy as np
 
 from streetgen.geometry.grain import fractal, speckle, texture, tinted
-from streetgen.geometry.layout import Layout, Place
+from streetgen.geometry.layout import GroundSpot, Layout
 from streetgen.geometry.mesh import F64, Label, Material, Mesh, Texture, joined, placed
-from streetgen.geometry.solids import Stuff, boxes, quads, tube
-from streetgen.geometry.world import Part
+from streetgen.geometry.solids import Surface, boxes, quads, tube
+from streetgen.geometry.world import StreetPart
 
-__all__ = ["KINDS", "Kind", "grown", "tree_materials", "trees"]
+__all__ = ["KINDS", "TreeSpecies", "grown", "tree_materials", "trees"]
 
 
 SIZE = (256, 256)
@@ -55,10 +55,10 @@ def _soil(rng: np.random.Generator) -> Texture:
     return texture(painted + 12 * speckle(SIZE, 1.2, rng)[..., None])
 
 
-BARK = Stuff("bark", Label.VEGETATION, 1.2)
-LEAF = Stuff("leaf", Label.VEGETATION)
-SOIL = Stuff("soil", Label.PAVEMENT)
-GUARD = Stuff("tree guard", Label.OBJECT)
+BARK = Surface("bark", Label.VEGETATION, 1.2)
+LEAF = Surface("leaf", Label.VEGETATION)
+SOIL = Surface("soil", Label.PAVEMENT)
+GUARD = Surface("tree guard", Label.OBJECT)
 PIT_HALF_M = 0.7
 GROWN = 4
 """Different trees in a street."""
@@ -67,7 +67,7 @@ SINK_M = 0.05
 
 
 @dataclass(frozen=True)
-class Kind:
+class TreeSpecies:
     """The habit of a species.
 
     ``trunk_m`` to the first limb, ``limbs`` of ``reach_m``, rising by ``rise`` (0 level, 1
@@ -86,9 +86,9 @@ class Kind:
 
 
 KINDS = (
-    Kind(3.0, 0.17, 10, 2.1, 0.60, 2, 3, 12_000, 0.075),
-    Kind(2.8, 0.13, 13, 1.6, 0.90, 2, 3, 11_000, 0.062),
-    Kind(3.3, 0.20, 9, 2.4, 0.55, 2, 3, 13_000, 0.085),
+    TreeSpecies(3.0, 0.17, 10, 2.1, 0.60, 2, 3, 12_000, 0.075),
+    TreeSpecies(2.8, 0.13, 13, 1.6, 0.90, 2, 3, 11_000, 0.062),
+    TreeSpecies(3.3, 0.20, 9, 2.4, 0.55, 2, 3, 13_000, 0.085),
 )
 
 
@@ -100,7 +100,7 @@ class Growth:
     twigs: list[tuple[F64, F64]] = field(default_factory=list)
 
 
-def trees(layout: Layout, rng: np.random.Generator) -> Part:
+def trees(layout: Layout, rng: np.random.Generator) -> StreetPart:
     """Return a tree in its pit at each of the layout's places."""
     stock = [grown(KINDS[i % len(KINDS)], rng) for i in range(GROWN)]
     meshes: list[Mesh] = []
@@ -108,10 +108,10 @@ def trees(layout: Layout, rng: np.random.Generator) -> Part:
         scale = rng.uniform(0.85, 1.2)
         meshes += [placed(mesh, _upright(place, scale)) for mesh in stock[rng.integers(GROWN)]]
         meshes += _pit(place)
-    return Part(tuple(meshes), tree_materials())
+    return StreetPart(tuple(meshes), tree_materials())
 
 
-def grown(kind: Kind, rng: np.random.Generator) -> list[Mesh]:
+def grown(kind: TreeSpecies, rng: np.random.Generator) -> list[Mesh]:
     """Return a tree whose foot is at the origin: bark and leaves."""
     growth = Growth()
     height = np.array([-SINK_M, 0.05, 0.25, 0.5, 0.75, 1.0, 1.35]) * kind.trunk_m
@@ -136,7 +136,7 @@ def grown(kind: Kind, rng: np.random.Generator) -> list[Mesh]:
 
 def _branch(
     growth: Growth,
-    kind: Kind,
+    kind: TreeSpecies,
     ray: tuple[F64, F64],
     length_m: float,
     girth_m: float,
@@ -161,7 +161,7 @@ def _branch(
         _branch(growth, kind, next_ray, 0.62 * length_m, 0.5 * girth_m, forks - 1, rng)
 
 
-def _leaves(kind: Kind, twigs: list[tuple[F64, F64]], rng: np.random.Generator) -> Mesh:
+def _leaves(kind: TreeSpecies, twigs: list[tuple[F64, F64]], rng: np.random.Generator) -> Mesh:
     """Two quads a leaf, around points along the twigs."""
     ends = np.array(twigs)
     count = kind.leaves
@@ -189,13 +189,13 @@ def _unit(vectors: F64) -> F64:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
 
 
-def _upright(place: Place, scale: float) -> F64:
+def _upright(place: GroundSpot, scale: float) -> F64:
     cos, sin = np.cos(place.heading_rad) * scale, np.sin(place.heading_rad) * scale
     x, y, z = place.x_m, place.y_m, place.z_m
     return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, scale, z], [0, 0, 0, 1]])
 
 
-def _pit(place: Place) -> list[Mesh]:
+def _pit(place: GroundSpot) -> list[Mesh]:
     """Soil in a frame of iron, level with the pavement."""
     centre, half = np.array([place.x_m, place.y_m]), PIT_HALF_M
     (x0, y0), (x1, y1), z = centre - half, centre + half, place.z_m + 0.012

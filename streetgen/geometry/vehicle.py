@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from streetgen.geometry.mesh import F64, Label, Mesh, joined, placed
 from streetgen.geometry.signage import atlas_uv
-from streetgen.geometry.solids import Stuff, boxes, disc, quads, tube
+from streetgen.geometry.solids import Surface, boxes, disc, quads, tube
 from streetgen.geometry.vehicle_body import body, surface_of
 from streetgen.geometry.vehicle_shape import BODIES, BodyShape
 from streetgen.geometry.vehicle_trim import LIVERIES, PAINTS, PLATES, number_plate, trim
@@ -22,7 +22,7 @@ __all__ = [
     "BOX_HIGH_M",
     "BOX_LOW_M",
     "KINDS",
-    "Vehicle",
+    "VehicleLooks",
     "cargo",
     "revolved",
     "standing",
@@ -31,10 +31,10 @@ __all__ = [
     "world_from_vehicle",
 ]
 
-WALL = Stuff("livery", Label.VEHICLE)
-EDGE = Stuff("car chrome", Label.VEHICLE)
-TRIM = Stuff("car trim", Label.VEHICLE)
-LAMP = Stuff("car tail lamp", Label.VEHICLE)
+WALL = Surface("livery", Label.VEHICLE)
+EDGE = Surface("car chrome", Label.VEHICLE)
+TRIM = Surface("car trim", Label.VEHICLE)
+LAMP = Surface("car tail lamp", Label.VEHICLE)
 BOX_LOW_M, BOX_HIGH_M = 1.02, 3.25
 HALF_WIDTH_M = 1.16
 EDGE_M = 0.05
@@ -131,10 +131,10 @@ def _tail(rear_m: float, plate: int) -> list[Mesh]:
 
 
 SIDES = 32
-TYRE = Stuff("tyre", Label.VEHICLE)
-RIM = Stuff("rim", Label.VEHICLE)
-DARK = Stuff("car gap", Label.VEHICLE)
-BRAKE = Stuff("brake disc", Label.VEHICLE)
+TYRE = Surface("tyre", Label.VEHICLE)
+RIM = Surface("rim", Label.VEHICLE)
+DARK = Surface("car gap", Label.VEHICLE)
+BRAKE = Surface("brake disc", Label.VEHICLE)
 TYRE_PROFILE = (
     *((0.66, 0.42), (0.70, 0.47), (0.80, 0.5), (0.92, 0.49), (0.985, 0.43), (1.0, 0.36)),
     *((1.0, -0.36), (0.985, -0.43), (0.92, -0.49), (0.70, -0.47), (0.66, -0.42)),
@@ -160,7 +160,7 @@ def wheel(radius_m: float, width_m: float, spokes: int, outside: int) -> list[Me
     return [placed(part, turned) for part in parts]
 
 
-def revolved(stuff: Stuff, profile: ArrayLike, sides: int) -> Mesh:
+def revolved(made_of: Surface, profile: ArrayLike, sides: int) -> Mesh:
     """Return the surface of a profile [N, 2] of (radius, y) turned about the y axis, smooth.
 
     Seen from outside the profile runs from the +y end to the -y end.
@@ -178,8 +178,8 @@ def revolved(stuff: Stuff, profile: ArrayLike, sides: int) -> Mesh:
         vertices=_about_y(points, turn).astype(np.float32),
         faces=corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3).astype(np.int32),
         uv=np.ascontiguousarray(uv.reshape(-1, 2), np.float32),
-        material=stuff.material,
-        label=stuff.label,
+        material=made_of.material,
+        label=made_of.label,
         normals=_about_y(out, turn).astype(np.float32),
     )
 
@@ -227,7 +227,7 @@ WHEEL_INSET_M = 0.035
 
 
 @dataclass(frozen=True)
-class Vehicle:
+class VehicleLooks:
     """What a vehicle looks like: one of ``KINDS``, its paint, plate and, on a truck, its firm."""
 
     kind: str
@@ -237,7 +237,7 @@ class Vehicle:
     spokes: int = 7
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator) -> Vehicle:
+    def drawn(cls, rng: np.random.Generator) -> VehicleLooks:
         """Return a vehicle by chance, kinds and paints as common as in a street."""
         kind = KINDS[int(rng.choice(len(KINDS), p=SHARES))]
         paint = tuple(PAINTS)[int(rng.choice(len(PAINTS), p=PAINT_SHARES))]
@@ -250,7 +250,7 @@ class Vehicle:
         return TRUCK_LENGTH_M if self.kind == "truck" else BODIES[self.kind].length_m
 
 
-def vehicle(looks: Vehicle) -> list[Mesh]:
+def vehicle(looks: VehicleLooks) -> list[Mesh]:
     """Return a vehicle in its own frame, one mesh a material."""
     shape = BODIES["cab" if looks.kind == "truck" else looks.kind]
     surface = surface_of(shape)
@@ -275,7 +275,7 @@ def world_from_vehicle(x_m: float, y_m: float, heading_rad: float) -> F64:
     return np.array([[cos, -sin, 0, x_m], [sin, cos, 0, y_m], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
-def _wheels(looks: Vehicle, shape: BodyShape) -> list[Mesh]:
+def _wheels(looks: VehicleLooks, shape: BodyShape) -> list[Mesh]:
     truck = looks.kind == "truck"
     axles = (*shape.axles_m, TRUCK_REAR_AXLE_M) if truck else shape.axles_m
     width = 0.24 if truck else 0.205

@@ -31,7 +31,7 @@ Codes = NDArray[np.int8]
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class SurfaceGrid:
     """A grid of points [A, B, 3] whose quads have a material code each, [A - 1, B - 1]."""
 
     points: F64
@@ -43,8 +43,8 @@ class BodySurface:
     """The loft and its two ends, with the places that fittings are fixed to."""
 
     sides: Lofted
-    nose: Patch
-    tail: Patch
+    nose: SurfaceGrid
+    tail: SurfaceGrid
     codes: Codes
 
     def column(self, station: float) -> int:
@@ -78,7 +78,7 @@ def surface_of(shape: BodyShape) -> BodySurface:
 
 def body(shape: BodyShape, surface: BodySurface, paint: str) -> list[Mesh]:
     """Return the body in the vehicle's frame (see ``lofted``), one mesh a material."""
-    patches = [Patch(surface.sides.points, surface.codes), surface.nose, surface.tail]
+    patches = [SurfaceGrid(surface.sides.points, surface.codes), surface.nose, surface.tail]
     names = {
         PAINT: paint,
         GLASS: "car glass",
@@ -121,7 +121,7 @@ def _side_codes(shape: BodyShape, surface: Lofted) -> Codes:
     return np.concatenate([half, half[:, ::-1]], axis=1)
 
 
-def _end(shape: BodyShape, outline: F64, nose: bool) -> Patch:
+def _end(shape: BodyShape, outline: F64, nose: bool) -> SurfaceGrid:
     """A face that closes the outline [2 M + 1, 3]: rows by height, columns from side to side."""
     rows = Rows.MIDDLE + 1
     start, end = outline[:rows], outline[: rows - 2 : -1]
@@ -142,10 +142,10 @@ def _end(shape: BodyShape, outline: F64, nose: bool) -> Patch:
         codes[Rows.GRILLE_LOW - 1 : Rows.GRILLE_HIGH, from_middle < 0.82] = GRILLE
         codes[Rows.LAMP_LOW : Rows.LAMP_HIGH, from_middle < 0.5] = GRILLE
         codes[Rows.LAMP_HIGH - 1, from_middle < 0.5] = BRIGHT
-    return Patch(points, codes)
+    return SurfaceGrid(points, codes)
 
 
-def _cut(patches: list[Patch], names: dict[int, str]) -> list[Mesh]:
+def _cut(patches: list[SurfaceGrid], names: dict[int, str]) -> list[Mesh]:
     """One mesh a material, with the normals of the whole surface."""
     points = np.concatenate([patch.points.reshape(-1, 3) for patch in patches])
     starts = np.cumsum([0] + [patch.points[..., 0].size for patch in patches[:-1]])
@@ -171,7 +171,7 @@ def _cut(patches: list[Patch], names: dict[int, str]) -> list[Mesh]:
     return meshes
 
 
-def _quads(patch: Patch, start: int) -> I32:
+def _quads(patch: SurfaceGrid, start: int) -> I32:
     """Corner numbers [Q, 4], anticlockwise from outside."""
     count, width = patch.points.shape[:2]
     first = np.arange(count - 1)[:, None] * width + np.arange(width - 1)[None]

@@ -12,7 +12,7 @@ import numpy as np
 
 from streetgen.geometry.mesh import F64, Label, Material, Mesh
 from streetgen.geometry.signage import Lettered, atlas, atlas_uv
-from streetgen.geometry.solids import Stuff, boxes, disc, quads, tube
+from streetgen.geometry.solids import Surface, boxes, disc, quads, tube
 from streetgen.geometry.vehicle_body import BodySurface
 from streetgen.geometry.vehicle_section import FILLET_RINGS, Rows
 from streetgen.geometry.vehicle_shape import BodyShape
@@ -67,12 +67,12 @@ def vehicle_materials() -> tuple[Material, ...]:
     )
 
 
-GAP = Stuff("car gap", Label.VEHICLE)
-DARK = Stuff("car trim", Label.VEHICLE)
-PLATE = Stuff("number plate", Label.VEHICLE)
-CHROME = Stuff("car chrome", Label.VEHICLE)
-LAMP_LIGHT = Stuff("car lamp light", Label.VEHICLE)
-TAIL = Stuff("car tail lamp", Label.VEHICLE)
+GAP = Surface("car gap", Label.VEHICLE)
+DARK = Surface("car trim", Label.VEHICLE)
+PLATE = Surface("number plate", Label.VEHICLE)
+CHROME = Surface("car chrome", Label.VEHICLE)
+LAMP_LIGHT = Surface("car lamp light", Label.VEHICLE)
+TAIL = Surface("car tail lamp", Label.VEHICLE)
 PLATE_SIZE_M = (0.52, 0.11)
 GAP_M = 0.007
 LIFT_M = 0.002
@@ -136,13 +136,13 @@ def _mirror(shape: BodyShape, surface: BodySurface, paint: str, side: int) -> li
     station = shape.side_windows[0][0] + 0.10
     foot = surface.point(station, Rows.GLASS_LOW, side)
     middle = foot + np.array([0.02, side * 0.135, 0.075])
-    shell = _ellipsoid(Stuff(paint, Label.VEHICLE), middle, np.array([0.075, 0.125, 0.08]))
+    shell = _ellipsoid(Surface(paint, Label.VEHICLE), middle, np.array([0.075, 0.125, 0.08]))
     glass = disc(CHROME, middle - (0.052, 0, 0), (-1, 0, 0), 0.07, 16)
     arm = boxes(DARK, np.minimum(foot, middle) - 0.015, np.maximum(foot, middle) + 0.015)
     return [shell, glass, arm]
 
 
-def _ellipsoid(stuff: Stuff, middle: F64, radii: F64) -> Mesh:
+def _ellipsoid(made_of: Surface, middle: F64, radii: F64) -> Mesh:
     """A smooth ball stretched along the axes; at 0.65 of its length it is cut flat behind."""
     away = np.linspace(0.03, np.pi - 0.03, 9)[:, None]
     turn = np.linspace(0, 2 * np.pi, 15)[None]
@@ -158,8 +158,8 @@ def _ellipsoid(stuff: Stuff, middle: F64, radii: F64) -> Mesh:
         vertices=(np.maximum(unit, (-0.65, -1.0, -1.0)) * radii + middle).astype(np.float32),
         faces=corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3).astype(np.int32),
         uv=np.zeros((len(unit), 2), np.float32),
-        material=stuff.material,
-        label=stuff.label,
+        material=made_of.material,
+        label=made_of.label,
         normals=normals.astype(np.float32),
     )
 

@@ -1,11 +1,12 @@
 """The whole street: what stands in it, what moves in it, and the light over it.
 
 * A module of ``streetgen.geometry`` that adds something offers a function
-  ``(layout, rng) -> Part`` (``tree.trees``, ``furniture.signs``, ``road.road``). The layout says
-  where things may stand; each part has its own generator, so that parts do not affect each other.
+  ``(layout, rng) -> StreetPart`` (``tree.trees``, ``furniture.signs``, ``road.road``). The layout
+  says where things may stand. Each part has its own generator, so that parts do not affect each
+  other.
 * ``sky.clear_sky(rng) -> Sky`` is the light of a scene that names no other.
 * The settings of an effect on geometry, light or surfaces have ``change(world, rng) -> World``. A
-  ``Part`` brings its materials along; two materials of one name must be the same object.
+  ``StreetPart`` brings its materials along; two materials of one name must be the same object.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from rfcore.errors import InvalidInput
 from streetgen.geometry.layout import Layout
 from streetgen.geometry.mesh import F32, F64, Colour, Material, Mesh
 
-__all__ = ["Mover", "Part", "Sky", "World"]
+__all__ = ["Mover", "Sky", "StreetPart", "World"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ class Mover:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class StreetPart:
     """Meshes, some of which may move, and the materials that they name."""
 
     meshes: tuple[Mesh, ...]
@@ -89,7 +90,7 @@ class World:
             if mesh.material not in self.materials:
                 raise InvalidInput("world.materials", f"have no '{mesh.material}'")
 
-    def plus(self, part: Part) -> World:
+    def plus(self, part: StreetPart) -> World:
         """Return the world with a part in it; raise ``InvalidInput`` for a name taken twice."""
         materials = dict(self.materials)
         for material in part.materials:

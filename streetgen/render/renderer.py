@@ -20,7 +20,7 @@ from streetgen.geometry.world import World
 from streetgen.render.backend import Backend, load_mitsuba
 from streetgen.render.mitsuba_scene import MitsubaScene
 
-__all__ = ["RenderedView", "Renderer", "Sampling", "cast_pixel_rays"]
+__all__ = ["PathTracer", "RenderedFrame", "Sampling", "cast_pixel_rays"]
 
 
 def cast_pixel_rays(
@@ -101,7 +101,7 @@ class Sampling:
 
 
 @dataclass(frozen=True, eq=False)
-class RenderedView:
+class RenderedFrame:
     """``colour`` float32 [H, W, 3], linear, 1 is white; ``depth_m`` float32 [H, W], z, infinite in
     the sky; ``labels`` uint8 [H, W] of ``streetgen.geometry.mesh.Label``.
     """
@@ -111,7 +111,7 @@ class RenderedView:
     labels: NDArray[np.uint8]
 
 
-class Renderer:
+class PathTracer:
     """Renders views of a world."""
 
     def __init__(self, world: World, sampling: Sampling, backend: Backend, threads: int) -> None:
@@ -129,7 +129,7 @@ class Renderer:
         self._mi.set_variant(self._backend.variant)
         self._loaded.at(time_s)
 
-    def render(self, camera: Camera, time_s: float = 0.0) -> RenderedView:
+    def render(self, camera: Camera, time_s: float = 0.0) -> RenderedFrame:
         """Return what the camera sees at that time."""
         self.at(time_s)
         sensor = self._mi.load_dict(_sensor(self._mi, camera))
@@ -138,10 +138,10 @@ class Renderer:
         depth_m, labels = cast_pixel_rays(self._mi, self._backend, self._loaded, camera)
         colour = _denoised(noisy, np.clip(guides[..., :3], 0, 1), guides[..., 3:])
         exposure = np.float32(self._loaded.exposure)
-        return RenderedView(np.maximum(colour, 0) * exposure, depth_m, labels)
+        return RenderedFrame(np.maximum(colour, 0) * exposure, depth_m, labels)
 
     def cast(self, camera: Camera, time_s: float = 0.0) -> tuple[F32, NDArray[np.uint8]]:
-        """Return depth and labels alone, as in ``RenderedView``, in a hundredth of the time."""
+        """Return depth and labels alone, as in ``RenderedFrame``, in a hundredth of the time."""
         self.at(time_s)
         return cast_pixel_rays(self._mi, self._backend, self._loaded, camera)
 

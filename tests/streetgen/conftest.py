@@ -5,8 +5,8 @@ import pytest
 
 from streetgen.geometry.layout import Geometry, Layout
 from streetgen.geometry.mesh import Label, Material
-from streetgen.geometry.solids import Stuff, boxes, quads
-from streetgen.geometry.world import Part, Sky, World
+from streetgen.geometry.solids import Surface, boxes, quads
+from streetgen.geometry.world import Sky, StreetPart, World
 
 
 @pytest.fixture(scope="session")
@@ -17,12 +17,13 @@ def yard() -> World:
     sky = np.full((32, 64, 3), 0.4, np.float32)
     floor = [(-40, -40, 0), (40, -40, 0), (40, 40, 0), (-40, 40, 0)]
     uv = [(x / 4, -y / 4) for x, y, _ in floor]
-    part = Part(
+    part = StreetPart(
         (
-            quads(Stuff("tiles", Label.ROAD), [floor], [uv]),
-            boxes(Stuff("lacquer", Label.VEHICLE), (4, 1, 0), (6, 2, 1.5)),
+            quads(Surface("tiles", Label.ROAD), [floor], [uv]),
+            boxes(Surface("lacquer", Label.VEHICLE), (4, 1, 0), (6, 2, 1.5)),
             quads(
-                Stuff("wall", Label.BUILDING), [[(10, 9, 0), (10, -9, 0), (10, -9, 3), (10, 9, 3)]]
+                Surface("wall", Label.BUILDING),
+                [[(10, 9, 0), (10, -9, 0), (10, -9, 3), (10, 9, 3)]],
             ),
         ),
         (

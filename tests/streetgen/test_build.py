@@ -29,22 +29,27 @@ from streetgen.build.scene_renderer import (
 )
 from streetgen.effects.lens import LensDistortion
 from streetgen.render.backend import Backend
-from streetgen.render.renderer import RenderedView
-from streetgen.scene_file import Drive, LocalisationNoise, Scene, Training
+from streetgen.render.renderer import RenderedFrame
+from streetgen.scene_file import DriveSettings, LocalisationNoise, Scene, TrainingSettings
 from streetgen.shots import Selection, Shot
 
-SCENE = Scene("s", "s", drive=Drive(duration_s=0.5, thinned_hz=(10.0,)), train=Training(views=4))
+SCENE = Scene(
+    "s",
+    "s",
+    drive=DriveSettings(duration_s=0.5, thinned_hz=(10.0,)),
+    train=TrainingSettings(views=4),
+)
 SIZE_PX = (32, 18)
 
 
 class RoadRenderer:
     """Stands in for the path tracer: a grey road 1.62 m below, each pixel of its own shade."""
 
-    def render(self, *_: object) -> RenderedView:
+    def render(self, *_: object) -> RenderedFrame:
         rows = np.arange(18) + 0.5 - 9
         depth_m = np.where(rows > 0, 1.62 * 16 / np.maximum(rows, 0.1), np.inf)
         shade = np.linspace(0.05, 0.9, 18 * 32, dtype=np.float32).reshape(18, 32, 1)
-        return RenderedView(
+        return RenderedFrame(
             colour=np.repeat(shade, 3, axis=2),
             depth_m=np.repeat(depth_m[:, None], 32, axis=1).astype(np.float32),
             labels=np.repeat(np.where(rows > 0, 1, 0)[:, None], 32, axis=1).astype(np.uint8),
@@ -250,7 +255,9 @@ def test_a_shot_says_where_it_belongs() -> None:
 
 
 def test_a_rig_is_recorded_with_a_file_that_the_agent_reads(tmp_path: Path) -> None:
-    drive = Drive(duration_s=0.3, rate_hz=10.0, thinned_hz=(), rig="mid_front,mid_back,low_left")
+    drive = DriveSettings(
+        duration_s=0.3, rate_hz=10.0, thinned_hz=(), rig="mid_front,mid_back,low_left"
+    )
     build(tmp_path, replace(SCENE, drive=drive), "rig", frames="0:8")
     rig = read_rig(tmp_path)
     assert [camera.name for camera in rig.cameras] == ["mid_front", "mid_back", "low_left"]

@@ -15,14 +15,29 @@ from streetgen.frame import LinearFrame
 from streetgen.geometry.layout import Geometry, Layout
 from streetgen.geometry.mesh import Label, Material
 from streetgen.geometry.sky import Daylight, overcast_sky, sunny_sky
-from streetgen.geometry.solids import Stuff, boxes
-from streetgen.geometry.world import Part, Sky, World
+from streetgen.geometry.solids import Surface, boxes
+from streetgen.geometry.world import Sky, StreetPart, World
 from streetgen.plan import plain_frame
-from streetgen.scene_file import Drive, Evaluation, LocalisationNoise, Rig, Scene, Training
+from streetgen.scene_file import (
+    DriveSettings,
+    EvaluationSettings,
+    LocalisationNoise,
+    RigSettings,
+    Scene,
+    TrainingSettings,
+)
 from streetgen.shots import Split, shots_of, thinned_indices
 from streetgen.trajectory import measured_pose
 
-SHORT = Scene("x", "x", Geometry(length_m=60.0), Rig(), Training(6), Evaluation(1), Drive(0.2))
+SHORT = Scene(
+    "x",
+    "x",
+    Geometry(length_m=60.0),
+    RigSettings(),
+    TrainingSettings(6),
+    EvaluationSettings(1),
+    DriveSettings(0.2),
+)
 OTHER = {bool: lambda v: not v, int: lambda v: v + 1, float: lambda v: 0.5 * v + 0.0625}
 SPECIAL = {
     "directions": "there",
@@ -89,26 +104,27 @@ def low_skies(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("streetgen.effects.overcast.overcast_sky", grey)
     blank = Sky(np.full((16, 32, 3), 0.5, np.float32))
     monkeypatch.setattr("streetgen.assembly.clear_sky", lambda _rng: blank)
-    monkeypatch.setattr("streetgen.assembly.road", lambda *_: Part((), ()))
+    monkeypatch.setattr("streetgen.assembly.road", lambda *_: StreetPart((), ()))
     monkeypatch.setattr("streetgen.assembly.buildings", blocks_for_buildings)
     monkeypatch.setattr("streetgen.assembly.trees", posts_for_trees)
 
 
-def blocks_for_buildings(layout: Layout, _rng: np.random.Generator) -> Part:
+def blocks_for_buildings(layout: Layout, _rng: np.random.Generator) -> StreetPart:
     """What is as high as a house: painting its walls takes seconds."""
     blocks = [
-        boxes(Stuff("block", Label.BUILDING), (p.start_m, p.y_m, 0), (p.end_m, p.y_m, p.height_m))
+        boxes(Surface("block", Label.BUILDING), (p.start_m, p.y_m, 0), (p.end_m, p.y_m, p.height_m))
         for p in layout.plots
     ]
-    return Part(tuple(blocks), (Material("block", (0.1, 0.1, 0.1)),))
+    return StreetPart(tuple(blocks), (Material("block", (0.1, 0.1, 0.1)),))
 
 
-def posts_for_trees(layout: Layout, _rng: np.random.Generator) -> Part:
+def posts_for_trees(layout: Layout, _rng: np.random.Generator) -> StreetPart:
     """What stands where a tree would: growing them takes seconds."""
     posts = [
-        boxes(Stuff("stem", Label.POLE), (t.x_m, t.y_m, 0), (t.x_m, t.y_m, 1)) for t in layout.trees
+        boxes(Surface("stem", Label.POLE), (t.x_m, t.y_m, 0), (t.x_m, t.y_m, 1))
+        for t in layout.trees
     ]
-    return Part(tuple(posts), (Material("stem", (0.1, 0.1, 0.1)),))
+    return StreetPart(tuple(posts), (Material("stem", (0.1, 0.1, 0.1)),))
 
 
 @pytest.mark.parametrize(
@@ -126,7 +142,7 @@ def test_a_key_of_an_effect_changes_what_it_makes(effect: Any, key: str) -> None
 def changed_digest(settings: Any, effect: Any) -> str:
     layout = Layout(Geometry(length_m=40.0))
     sky = Sky(np.full((16, 32, 3), 0.5, np.float32), sun_radiance=(2.0, 2.0, 2.0))
-    bare = World(layout, sky).plus(Part((), (Material("asphalt", (0.1, 0.1, 0.1)),)))
+    bare = World(layout, sky).plus(StreetPart((), (Material("asphalt", (0.1, 0.1, 0.1)),)))
     return world_digest(settings.change(bare, rng_of(effect, 1, 0)))
 
 
@@ -142,7 +158,14 @@ def frame_digest(settings: Any, effect: Any) -> str:
     ("kind", "key"),
     [
         pair
-        for kind in (Geometry, Rig, Training, Evaluation, Drive, LocalisationNoise)
+        for kind in (
+            Geometry,
+            RigSettings,
+            TrainingSettings,
+            EvaluationSettings,
+            DriveSettings,
+            LocalisationNoise,
+        )
         for pair in keys_of(kind)
     ],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
@@ -153,7 +176,12 @@ def test_a_key_of_a_part_changes_the_street_or_its_pictures(kind: type[Any], key
         pose = shots_of(SHORT, Split.DRIVE)[1].camera.world_from_cam
         assert measured_pose(pose, noise, 1) != measured_pose(pose, changed(noise, key), 1)
         return
-    part = {Geometry: "geometry", Rig: "rig", Training: "train", Evaluation: "evaluation"}
+    part = {
+        Geometry: "geometry",
+        RigSettings: "rig",
+        TrainingSettings: "train",
+        EvaluationSettings: "evaluation",
+    }
     name = part.get(kind, "drive")
     other = replace(SHORT, **{name: changed(getattr(SHORT, name), key)})
     assert wanted(SHORT, kind) != wanted(other, kind)

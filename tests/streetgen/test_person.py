@@ -28,9 +28,9 @@ from streetgen.geometry.person import (
     stride_m,
     walking,
 )
-from streetgen.geometry.solids import Stuff, loft
+from streetgen.geometry.solids import Surface, loft
 
-CLAY = Stuff("clay", Label.OBJECT)
+CLAY = Surface("clay", Label.OBJECT)
 PHASES = np.linspace(0, 2 * np.pi, 25)
 BUDGET = 8_000
 LINKS = {("thigh", "shank"): THIGH, ("shank", "foot"): SHANK, ("upper arm", "forearm"): UPPER_ARM}

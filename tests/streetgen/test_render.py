@@ -10,11 +10,11 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from streetgen.geometry.mesh import Label
-from streetgen.geometry.solids import Stuff, boxes
+from streetgen.geometry.solids import Surface, boxes
 from streetgen.geometry.world import Mover, Sky, World
 from streetgen.render.backend import PROBE, Backend, chosen_backend
 from streetgen.render.mitsuba_scene import with_sun
-from streetgen.render.renderer import Renderer, Sampling
+from streetgen.render.renderer import PathTracer, Sampling
 from streetgen.trajectory import looking
 
 SCALAR = Backend("scalar_rgb")
@@ -31,11 +31,11 @@ def fastest() -> Backend:
 
 
 @pytest.fixture(scope="module")
-def renderer(yard: World, fastest: Backend) -> Renderer:
-    return Renderer(yard, Sampling(16), fastest, 1)
+def renderer(yard: World, fastest: Backend) -> PathTracer:
+    return PathTracer(yard, Sampling(16), fastest, 1)
 
 
-def test_a_known_point_lands_on_its_pixel_at_its_depth(renderer: Renderer) -> None:
+def test_a_known_point_lands_on_its_pixel_at_its_depth(renderer: PathTracer) -> None:
     """Depths of the floor, the box and the wall by algebra, at every pixel."""
     seen_by = camera()
     view = renderer.render(seen_by)
@@ -50,7 +50,7 @@ def test_a_known_point_lands_on_its_pixel_at_its_depth(renderer: Renderer) -> No
     assert set(np.unique(view.labels)) == {0, Label.ROAD, Label.BUILDING, Label.VEHICLE}
 
 
-def test_unprojected_pixels_lie_on_the_surfaces_they_show(renderer: Renderer) -> None:
+def test_unprojected_pixels_lie_on_the_surfaces_they_show(renderer: PathTracer) -> None:
     seen_by = camera(yaw_rad=0.3)
     view = renderer.render(seen_by)
     k = seen_by.intrinsics
@@ -62,11 +62,11 @@ def test_unprojected_pixels_lie_on_the_surfaces_they_show(renderer: Renderer) ->
 
 
 def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
-    yard: World, renderer: Renderer, fastest: Backend
+    yard: World, renderer: PathTracer, fastest: Backend
 ) -> None:
     first, later = renderer.render(camera()), renderer.render(camera(), time_s=3.0)
-    two_threads = Renderer(yard, Sampling(16), fastest, 2).render(camera())
-    other_seed = Renderer(yard, Sampling(16, seed=2), fastest, 2).render(camera())
+    two_threads = PathTracer(yard, Sampling(16), fastest, 2).render(camera())
+    other_seed = PathTracer(yard, Sampling(16, seed=2), fastest, 2).render(camera())
     assert first.colour.tobytes() == later.colour.tobytes()
     assert first.colour.tobytes() == two_threads.colour.tobytes()
     assert first.colour.tobytes() != other_seed.colour.tobytes()
@@ -74,16 +74,16 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
     assert first.colour.min() >= 0
 
 
-def test_the_scalar_variant_shows_the_same(yard: World, renderer: Renderer) -> None:
+def test_the_scalar_variant_shows_the_same(yard: World, renderer: PathTracer) -> None:
     """The samples differ, so colours agree only to their noise; geometry agrees to rounding."""
     small = camera(32, 18)
-    one, other = renderer.render(small), Renderer(yard, Sampling(16), SCALAR, 1).render(small)
+    one, other = renderer.render(small), PathTracer(yard, Sampling(16), SCALAR, 1).render(small)
     np.testing.assert_array_equal(one.labels, other.labels)
     np.testing.assert_allclose(one.depth_m, other.depth_m, rtol=1e-5)
     assert abs(one.colour - other.colour).mean() < 0.03 * one.colour.mean()
 
 
-def test_a_floor_in_the_sun_is_as_bright_as_radiometry_says(renderer: Renderer) -> None:
+def test_a_floor_in_the_sun_is_as_bright_as_radiometry_says(renderer: PathTracer) -> None:
     """Reflectance / pi times irradiance: of the sun's disc, and of a uniform dome, pi L."""
     view = renderer.render(camera())
     half_angle = np.radians(0.53 / 2)
@@ -101,8 +101,8 @@ def test_what_moves_is_where_it_is_at_that_time(yard: World, fastest: Backend) -
         matrix[1, 3] = -2.0 * time_s
         return matrix
 
-    ball = boxes(Stuff("lacquer", Label.OBJECT), (3, 0.0, 0.8), (3.4, 0.4, 1.2))
-    moving = Renderer(replace(yard, movers=(Mover((ball,), along_y),)), Sampling(4), fastest, 1)
+    ball = boxes(Surface("lacquer", Label.OBJECT), (3, 0.0, 0.8), (3.4, 0.4, 1.2))
+    moving = PathTracer(replace(yard, movers=(Mover((ball,), along_y),)), Sampling(4), fastest, 1)
     middles = []
     for time_s in (0.0, 0.5, 0.0):
         labels = moving.render(camera(), time_s).labels
@@ -135,7 +135,7 @@ def test_samples_that_are_no_square_are_refused(samples: int) -> None:
         Sampling(samples)
 
 
-def test_a_camera_off_its_middle_is_refused(renderer: Renderer) -> None:
+def test_a_camera_off_its_middle_is_refused(renderer: PathTracer) -> None:
     k = replace(camera().intrinsics, cx_px=30.0)
     with pytest.raises(InvalidInput, match="about the middle"):
         renderer.render(Camera(k, Pose.identity()))

@@ -11,7 +11,7 @@ from rfcore.camera import Pose
 from rfcore.dataset.mounts import RIG
 from rfcore.errors import InvalidInput
 from streetgen import load_scene
-from streetgen.scene_file import Drive, LocalisationNoise, Rig, Scene
+from streetgen.scene_file import DriveSettings, LocalisationNoise, RigSettings, Scene
 from streetgen.shots import Selection, Shot, Split, shots_of, thinned_indices
 from streetgen.trajectory import (
     drive_motion,
@@ -64,14 +64,14 @@ def test_training_uses_every_camera_in_both_directions() -> None:
 
 
 def test_cars_that_drive_there_keep_to_one_side() -> None:
-    there = replace(SCENE, rig=Rig(cameras=1, directions="there"))
+    there = replace(SCENE, rig=RigSettings(cameras=1, directions="there"))
     shots = shots_of(there, Split.TRAIN)
     assert places(shots)[:, 1].max() < -1.5
     assert all(forward(shot.camera.world_from_cam)[0] > 0.9 for shot in shots)
 
 
 def test_the_drive_goes_at_its_speed_and_rate() -> None:
-    scene = replace(SCENE, drive=Drive(duration_s=2.0, speed_mps=12.0, rate_hz=30.0))
+    scene = replace(SCENE, drive=DriveSettings(duration_s=2.0, speed_mps=12.0, rate_hz=30.0))
     shots = shots_of(scene, Split.DRIVE, (160, 90))
     assert len(shots) == 60
     assert shots[0].camera.intrinsics.fx_px == pytest.approx(80.0)
@@ -87,14 +87,17 @@ def test_lower_rates_are_every_nth_frame() -> None:
 
 @pytest.mark.parametrize("offset_m", [-0.5, 0.0, 1.2])
 def test_a_lane_offset_moves_the_drive_to_its_left(offset_m: float) -> None:
-    lane, moved = drive_pose(Drive(), 1.0), drive_pose(Drive(lane_offset_m=offset_m), 1.0)
+    lane, moved = (
+        drive_pose(DriveSettings(), 1.0),
+        drive_pose(DriveSettings(lane_offset_m=offset_m), 1.0),
+    )
     shift = np.array(moved.translation_m) - np.array(lane.translation_m)
     np.testing.assert_allclose(shift, [0, offset_m, 0], atol=1e-12)
 
 
 def test_velocity_and_turn_carry_one_pose_to_the_next() -> None:
     """To first order: what is left over a step dt is the acceleration's dt^2 / 2."""
-    drive, dt = Drive(), 1e-4
+    drive, dt = DriveSettings(), 1e-4
     for time_s in (0.3, 1.1, 2.0):
         motion = drive_motion(drive, time_s)
         now, then = drive_pose(drive, time_s), drive_pose(drive, time_s + dt)
@@ -192,7 +195,7 @@ def test_the_empty_streets_drive_has_sixteen_frames_at_two_hertz(
 
 
 def test_the_rig_drives_as_the_drive_does_and_only_if_asked_for() -> None:
-    scene = replace(SCENE, drive=Drive(duration_s=0.5, rate_hz=10.0, thinned_hz=()))
+    scene = replace(SCENE, drive=DriveSettings(duration_s=0.5, rate_hz=10.0, thinned_hz=()))
     assert all(shot.split is not Split.RIG for shot in Selection(scene, "all").shots())
     shots = Selection(scene, "rig").shots()
     assert len(shots) == 5 * 4
@@ -211,4 +214,4 @@ def test_the_rig_drives_as_the_drive_does_and_only_if_asked_for() -> None:
 
 def test_a_rig_of_cameras_that_are_not_is_refused() -> None:
     with pytest.raises(InvalidInput, match="roof"):
-        Drive(rig="mid_front,roof")
+        DriveSettings(rig="mid_front,roof")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from streetgen.geometry.mesh import Label, Mesh, faceted
-from streetgen.geometry.solids import Stuff, boxes, disc, quads, tube
+from streetgen.geometry.solids import Surface, boxes, disc, quads, tube
 
-CLAY = Stuff("clay", Label.OBJECT, tile_m=2.0)
+CLAY = Surface("clay", Label.OBJECT, tile_m=2.0)
 
 
 def edges(mesh: Mesh) -> Counter[tuple[tuple[float, ...], tuple[float, ...]]]:

@@ -13,19 +13,19 @@ from streetgen.geometry.grain import fractal
 from streetgen.geometry.layout import BAY_LENGTH_M, FACADE_M, FASCIA_M, Geometry, Layout
 from streetgen.geometry.mesh import Label, Mesh, joined
 from streetgen.geometry.road import road, slabs
-from streetgen.geometry.solids import Stuff
-from streetgen.geometry.world import Part
+from streetgen.geometry.solids import Surface
+from streetgen.geometry.world import StreetPart
 
 LAYOUT = Layout(Geometry(length_m=60.0))
 PARTS = (road, buildings, lamps, railings, wires)
 
 
 @pytest.fixture(scope="module")
-def built() -> dict[str, Part]:
+def built() -> dict[str, StreetPart]:
     return {part.__name__: part(LAYOUT, np.random.default_rng(1)) for part in PARTS}
 
 
-def digest(part: Part) -> str:
+def digest(part: StreetPart) -> str:
     found = hashlib.sha256()
     for mesh in joined(part.meshes):
         assert mesh.normals is not None
@@ -38,19 +38,19 @@ def digest(part: Part) -> str:
 
 @pytest.mark.parametrize("part", [road, lamps, railings, wires], ids=lambda part: part.__name__)
 def test_the_same_seed_gives_the_same_bytes(
-    part: Callable[..., Part], built: dict[str, Part]
+    part: Callable[..., StreetPart], built: dict[str, StreetPart]
 ) -> None:
     again = part(LAYOUT, np.random.default_rng(1))
     assert digest(again) == digest(built[part.__name__])
 
 
-def test_every_mesh_has_its_material(built: dict[str, Part]) -> None:
+def test_every_mesh_has_its_material(built: dict[str, StreetPart]) -> None:
     for part in built.values():
         named = {material.name for material in part.materials}
         assert {mesh.material for mesh in part.meshes} <= named
 
 
-def test_nothing_stands_in_the_way_of_a_car(built: dict[str, Part]) -> None:
+def test_nothing_stands_in_the_way_of_a_car(built: dict[str, StreetPart]) -> None:
     """Between the parking bays, from 2 cm to 4 m over the road, there is nothing."""
     for part in built.values():
         for mesh in part.meshes:
@@ -59,7 +59,7 @@ def test_nothing_stands_in_the_way_of_a_car(built: dict[str, Part]) -> None:
             assert not inside.any(), mesh.material
 
 
-def test_the_ground_is_where_the_plan_says(built: dict[str, Part]) -> None:
+def test_the_ground_is_where_the_plan_says(built: dict[str, StreetPart]) -> None:
     for mesh in built["road"].meshes:
         if mesh.label in (Label.ROAD, Label.MARKING):
             assert np.abs(mesh.vertices[:, 2]).max() < 0.01
@@ -78,7 +78,7 @@ def test_the_lines_of_the_bays_are_where_vehicles_park_and_off_the_crossings() -
     np.testing.assert_allclose(from_middle_m, BAY_LENGTH_M / 2, atol=0.06)
 
 
-def test_wires_are_thin_and_hang_over_the_cars(built: dict[str, Part]) -> None:
+def test_wires_are_thin_and_hang_over_the_cars(built: dict[str, StreetPart]) -> None:
     low = min(mesh.vertices[:, 2].min() for mesh in built["wires"].meshes)
     assert 5.5 < low < 7.0
     assert {mesh.label for mesh in built["wires"].meshes} == {Label.WIRE}
@@ -96,15 +96,15 @@ def test_a_wall_and_its_openings_fill_the_storey() -> None:
     assert (wall[:, 3] > wall[:, 1]).all()
 
 
-def stuff(name: str) -> Stuff:
-    return Stuff(name, Label.BUILDING)
+def surface(name: str) -> Surface:
+    return Surface(name, Label.BUILDING)
 
 
 @pytest.mark.parametrize("style", range(6))
 def test_a_facade_leaves_the_fascia_bare(style: int) -> None:
     """But for the rain pipe at its left edge nothing stands out where a sign may hang."""
     plot = LAYOUT.plots[style % len(LAYOUT.plots)]
-    look = BuildingStyle(stuff("wall"), stuff("frame"), stuff("door"))
+    look = BuildingStyle(surface("wall"), surface("frame"), surface("door"))
     low, high = FASCIA_M
     for mesh in facade(plot, look, np.random.default_rng(style)):
         u, v, w = mesh.vertices.T
@@ -117,7 +117,7 @@ def test_a_facade_leaves_the_fascia_bare(style: int) -> None:
     assert v.size == w.size
 
 
-def test_facades_stand_on_their_line_and_look_at_the_road(built: dict[str, Part]) -> None:
+def test_facades_stand_on_their_line_and_look_at_the_road(built: dict[str, StreetPart]) -> None:
     glass = [mesh for mesh in joined(built["buildings"].meshes) if mesh.label == Label.WINDOW]
     assert len(glass) == 1
     along = np.abs(glass[0].vertices[:, 0]) < 30

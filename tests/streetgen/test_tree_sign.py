@@ -10,7 +10,7 @@ from streetgen.geometry.layout import PAVEMENT_UP_M, Geometry, Layout
 from streetgen.geometry.mesh import Label, Mesh
 from streetgen.geometry.signage import FACES, NAMES, ROUND, face_picture, sign_materials
 from streetgen.geometry.tree import KINDS, grown, trees
-from streetgen.geometry.world import Part
+from streetgen.geometry.world import StreetPart
 
 LAYOUT = Layout(Geometry(length_m=100.0))
 TREE_BUDGET = 70_000
@@ -21,12 +21,12 @@ def rng(seed: int = 2) -> np.random.Generator:
 
 
 @pytest.fixture(scope="module")
-def forest() -> Part:
+def forest() -> StreetPart:
     return trees(LAYOUT, rng())
 
 
 @pytest.fixture(scope="module")
-def posted() -> Part:
+def posted() -> StreetPart:
     return signs(LAYOUT, rng())
 
 
@@ -50,7 +50,7 @@ def test_leaves_are_near_wood() -> None:
     assert np.quantile(away, 0.9) < 0.6
 
 
-def test_every_place_has_a_tree_in_a_pit(forest: Part) -> None:
+def test_every_place_has_a_tree_in_a_pit(forest: StreetPart) -> None:
     soil = [mesh for mesh in forest.meshes if mesh.material == "soil"]
     assert len(soil) == len(LAYOUT.trees) > 5
     for mesh, place in zip(soil, LAYOUT.trees, strict=True):
@@ -59,7 +59,7 @@ def test_every_place_has_a_tree_in_a_pit(forest: Part) -> None:
     assert {m.label for m in forest.meshes if m.material == "leaf"} == {Label.VEGETATION}
 
 
-def test_trees_and_signs_follow_from_the_seed(forest: Part, posted: Part) -> None:
+def test_trees_and_signs_follow_from_the_seed(forest: StreetPart, posted: StreetPart) -> None:
     for part, make in ((forest, trees), (posted, signs)):
         again, other = make(LAYOUT, rng()), make(LAYOUT, rng(3))
         assert same(part.meshes, again.meshes)
@@ -81,7 +81,7 @@ def test_a_sign_hangs_on_a_post_that_reaches_into_the_ground(face: int) -> None:
             assert np.abs(mesh.vertices[:, 0]).max() < 0.06, "it is clamped to its post"
 
 
-def test_all_posts_of_a_street_end_below_the_pavement(posted: Part) -> None:
+def test_all_posts_of_a_street_end_below_the_pavement(posted: StreetPart) -> None:
     for mesh in posted.meshes:
         assert np.isfinite(mesh.vertices).all()
     posts = [m for m in posted.meshes if m.material == "sign post" and np.ptp(m.vertices[:, 2]) > 2]
@@ -100,7 +100,7 @@ def test_lights_over_the_lane_hang_higher_than_a_truck() -> None:
         assert len(on) == 1
 
 
-def test_a_signs_face_looks_at_who_drives_up_to_it(posted: Part) -> None:
+def test_a_signs_face_looks_at_who_drives_up_to_it(posted: StreetPart) -> None:
     """On the left edge (y > 0) traffic comes from +x, on the right one from -x."""
     for mesh in posted.meshes:
         if mesh.material == "sign face":

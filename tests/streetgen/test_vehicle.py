@@ -9,7 +9,7 @@ import pytest
 from rfcore.errors import InvalidInput
 from streetgen.geometry.mesh import Label, Mesh
 from streetgen.geometry.signage import Lettered, atlas, atlas_uv, board
-from streetgen.geometry.vehicle import KINDS, Vehicle, standing, vehicle
+from streetgen.geometry.vehicle import KINDS, VehicleLooks, standing, vehicle
 from streetgen.geometry.vehicle_body import surface_of
 from streetgen.geometry.vehicle_shape import BODIES, BodyShape, curve
 from streetgen.geometry.vehicle_trim import PAINTS, PLATES, vehicle_materials
@@ -32,8 +32,8 @@ def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def looking_like(kind: str) -> Vehicle:
-    return Vehicle(kind, "paint red", plate=3, livery=1)
+def looking_like(kind: str) -> VehicleLooks:
+    return VehicleLooks(kind, "paint red", plate=3, livery=1)
 
 
 def vertices(meshes: list[Mesh]) -> np.ndarray:
@@ -121,9 +121,9 @@ def test_a_vehicle_that_is_turned_stands_where_it_is_put() -> None:
 
 
 def test_chance_draws_every_kind_and_most_paints_and_repeats_itself() -> None:
-    def draw() -> list[Vehicle]:
+    def draw() -> list[VehicleLooks]:
         rng = np.random.default_rng(1)
-        return [Vehicle.drawn(rng) for _ in range(300)]
+        return [VehicleLooks.drawn(rng) for _ in range(300)]
 
     drawn = draw()
     assert drawn == draw()

@@ -9,7 +9,7 @@ import pytest
 from rfcore.errors import InvalidInput
 from streetgen.geometry.layout import Geometry, Layout
 from streetgen.geometry.mesh import Label, Material, Mesh, faceted, joined, placed
-from streetgen.geometry.world import Part, Sky, World
+from streetgen.geometry.world import Sky, StreetPart, World
 
 
 def triangle(material: str = "clay", label: Label = Label.OBJECT) -> Mesh:
@@ -63,12 +63,12 @@ def test_a_mesh_that_is_none_is_refused(change: dict[str, object], said: str) ->
 def test_a_world_has_the_materials_its_meshes_name() -> None:
     clay = Material("clay", (0.4, 0.3, 0.2))
     empty = World(Layout(Geometry()), sky())
-    world = empty.plus(Part((triangle(),), (clay,)))
-    assert world.plus(Part((triangle(),), (clay,))).materials == {"clay": clay}
+    world = empty.plus(StreetPart((triangle(),), (clay,)))
+    assert world.plus(StreetPart((triangle(),), (clay,))).materials == {"clay": clay}
     with pytest.raises(InvalidInput, match="names two"):
-        world.plus(Part((), (Material("clay", (0, 0, 0)),)))
+        world.plus(StreetPart((), (Material("clay", (0, 0, 0)),)))
     with pytest.raises(InvalidInput, match="have no 'glass'"):
-        world.plus(Part((triangle("glass"),), ()))
+        world.plus(StreetPart((triangle("glass"),), ()))
     assert world.with_material(wet := replace(clay, gloss=True)).materials["clay"] is wet
 
 
