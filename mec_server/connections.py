@@ -37,7 +37,7 @@ from urllib.parse import quote, unquote
 
 from mec_server.ledger.budgets import Limit
 
-__all__ = ["MOST_HEADER_BYTES", "Connections", "Cut", "keep_silent_out", "source_of"]
+__all__ = ["MOST_HEADER_BYTES", "ClosedConnections", "Connections", "keep_silent_out", "source_of"]
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 SILENT_S = 5
@@ -98,7 +98,7 @@ def source_of(address: str) -> str:
 
 
 @dataclass(frozen=True)
-class Cut:
+class ClosedConnections:
     """Connections of one source that were shut down for one reason; ``barred``: its address."""
 
     source: str
@@ -108,7 +108,7 @@ class Cut:
 
 
 @dataclass
-class Account:
+class ByteAccount:
     """One connection's: what is known of it, and what it sent that became no message."""
 
     inode: str
@@ -125,7 +125,7 @@ class Account:
 
 
 @dataclass
-class Notes:
+class PeerNotes:
     """What calls told of a connection since the last look at it."""
 
     explained_bytes: float = 0.0
@@ -147,9 +147,9 @@ class Connections:
         self._of_address = of_address
         self._of_identity = of_identity
         self._port = 0
-        self._accounts: dict[str, Account] = {}
+        self._accounts: dict[str, ByteAccount] = {}
         """By peer, oldest first."""
-        self._notes: defaultdict[str, Notes] = defaultdict(Notes)
+        self._notes: defaultdict[str, PeerNotes] = defaultdict(PeerNotes)
         self._absent: set[str] = set()
         self._barred_s: dict[str, float] = {}
         self._swept_s: float | None = None
@@ -192,7 +192,7 @@ class Connections:
             self._notes[peer].is_exempt = True
 
     def offend(self, peer: str, limit: Limit, now: float) -> None:
-        """Cut a connection and bar its address at once. ``peer``: empty for one that is gone.
+        """ClosedConnections a connection and bar its address at once. ``peer``: empty for one that is gone.
 
         About 10 us a connection: not for what may happen often.
         """
@@ -208,8 +208,8 @@ class Connections:
             if connection.peer == peer:
                 _shut(connection)
 
-    def sweep(self, now: float) -> list[Cut]:
-        """Cut what is too much, bar where it came from, and return what was cut.
+    def sweep(self, now: float) -> list[ClosedConnections]:
+        """ClosedConnections what is too much, bar where it came from, and return what was cut.
 
         Not for the event loop: it takes about 10 us a connection.
         """
@@ -221,7 +221,7 @@ class Connections:
             # One that offended may be gone by now; its source is still to be barred.
             cut[_source_of_peer(peer), limit] += peer not in found or _shut(found[peer])
         cuts = [
-            Cut(source, limit, count, limit is not Limit.ADDRESS_CONNECTIONS)
+            ClosedConnections(source, limit, count, limit is not Limit.ADDRESS_CONNECTIONS)
             for (source, limit), count in cut.items()
             if count
         ]
@@ -249,7 +249,7 @@ class Connections:
             if peer in found and found[peer].inode == account.inode
         }
         self._accounts = known | {
-            peer: known.get(peer) or Account(each.inode) for peer, each in found.items()
+            peer: known.get(peer) or ByteAccount(each.inode) for peer, each in found.items()
         }
         for peer, account in self._accounts.items():
             self._update(account, found[peer], self._notes.get(peer), passed_s)
@@ -259,7 +259,7 @@ class Connections:
 
     @staticmethod
     def _update(
-        account: Account, connection: Connection, notes: Notes | None, passed_s: float
+        account: ByteAccount, connection: Connection, notes: PeerNotes | None, passed_s: float
     ) -> None:
         came = connection.received_bytes - account.received_bytes
         explained = 0.0

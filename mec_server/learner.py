@@ -32,12 +32,12 @@ from mec_server.tile_history import LEARNING, TileHistory, read_histories
 from mec_server.tile_learning import (
     CHECK_EVERY,
     CHECK_FRAMES,
-    Harm,
+    BitsIncrease,
     LearningJob,
     LearningRounds,
     percent_worse,
 )
-from mec_server.twin.state import TwinView
+from mec_server.twin.state import ReceivedPicture
 from rfcore.camera import Camera
 from rfcore.errors import RfedgeError
 from rfcore.field import RadianceField
@@ -107,7 +107,7 @@ class Learner:
             self.start()
         self._show(read_histories(self._job.recordings))
 
-    def report(self, harm: Harm) -> None:
+    def report(self, harm: BitsIncrease) -> None:
         """Tell the process what was found; nothing if there is none now."""
         if self._process is not None and self._process.stdin is not None:
             with suppress(BrokenPipeError, ValueError):  # it has ended, or is being restarted
@@ -150,13 +150,13 @@ class UnrecordedTrials:
         self,
         open_field: Callable[[str], RadianceField],
         failed: Callable[[Exception], None],
-        report: Callable[[Harm], None],
+        report: Callable[[BitsIncrease], None],
     ) -> None:
         self._open_field, self._report = open_field, report
         self._worker = Workers(1, failed, "trials", begin=work_when_idle)
         self._watched: Mapping[str, _Watched] = {}
         self._rested: Counter[tuple[CameraKey, str]] = Counter()
-        self._taken: list[TwinView] = []
+        self._taken: list[ReceivedPicture] = []
         self._is_trying = False
 
     def close(self) -> None:
@@ -172,7 +172,7 @@ class UnrecordedTrials:
             if not one.withdrawn
         }
 
-    def saw(self, view: TwinView) -> None:
+    def saw(self, view: ReceivedPicture) -> None:
         """Take a picture of a vehicle that is not recorded; called on the event loop."""
         watched = self._watched.get(view.field_id)
         if watched is None or view.frame.pose is None:
@@ -200,20 +200,20 @@ class UnrecordedTrials:
         for turn in [turn for turn in self._rested if turn[0][0] == vehicle_id]:
             del self._rested[turn]
 
-    def _finished(self, outcome: Harm | Exception) -> None:
+    def _finished(self, outcome: BitsIncrease | Exception) -> None:
         self._is_trying = False
         if isinstance(outcome, Exception):
             raise outcome
         self._report(outcome)
 
-    def _tried(self, watched: _Watched, views: Sequence[TwinView]) -> Harm:
+    def _tried(self, watched: _Watched, views: Sequence[ReceivedPicture]) -> BitsIncrease:
         field_id, vehicle_id = views[0].field_id, views[0].vehicle_id
         before, after = self._open_field(watched.replaced_id), self._open_field(field_id)
         drive = Pass(vehicle_id, tuple(map(_posed, views)))
-        return Harm(watched.tile, field_id, vehicle_id, percent_worse(before, after, drive))
+        return BitsIncrease(watched.tile, field_id, vehicle_id, percent_worse(before, after, drive))
 
 
-def _posed(view: TwinView) -> PosedPicture:
+def _posed(view: ReceivedPicture) -> PosedPicture:
     assert view.frame.pose is not None
     camera = Camera(view.intrinsics, view.frame.pose)
     return PosedPicture(view.frame.camera_id, camera, partial(rgb_from_i420, view.picture))
@@ -246,7 +246,7 @@ def _try(rounds: LearningRounds) -> None:
 def _follow_the_server(rounds: LearningRounds) -> None:
     """Take what the server reports, a line each, and end with it."""
     for line in sys.stdin.buffer:
-        rounds.report(Harm(**json.loads(line)))
+        rounds.report(BitsIncrease(**json.loads(line)))
     os._exit(0)
 
 

@@ -31,8 +31,8 @@ from rfcore.views import PosedPicture
 from rfcore.wire.tile_manifest import TileVersions
 
 __all__ = [
+    "RecordedPass",
     "Recordings",
-    "SeenPass",
     "by_light",
     "hour_of",
     "light_of",
@@ -51,7 +51,7 @@ LOOKED_AT = 5
 
 
 @dataclass(frozen=True)
-class SeenPass:
+class RecordedPass:
     """A recording that is over: its name, its pass, and what tells its light.
 
     ``gains``: logarithms of the colours' gains over the tile's own field; ``nearest_light``: None
@@ -146,11 +146,11 @@ def _colour_gains(field: RadianceField, frame: SeenFrame) -> NDArray[np.float64]
 
 
 def by_light(
-    passes: Sequence[SeenPass], versions: TileVersions
-) -> Iterator[tuple[str, list[SeenPass]]]:
+    passes: Sequence[RecordedPass], versions: TileVersions
+) -> Iterator[tuple[str, list[RecordedPass]]]:
     """Yield the passes of each light, oldest first; a light that is new gets a name of its hour."""
-    known: dict[str, list[SeenPass]] = {}
-    new: list[list[SeenPass]] = []
+    known: dict[str, list[RecordedPass]] = {}
+    new: list[list[RecordedPass]] = []
     for one in passes:
         if one.nearest_light is not None:
             known.setdefault(one.nearest_light, []).append(one)
@@ -168,7 +168,7 @@ def by_light(
         yield name, group
 
 
-def _same_light(first: SeenPass, second: SeenPass) -> bool:
+def _same_light(first: RecordedPass, second: RecordedPass) -> bool:
     return max(abs(a - b) for a, b in zip(first.gains, second.gains, strict=True)) <= SAME_LIGHT
 
 

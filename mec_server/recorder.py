@@ -35,11 +35,11 @@ from rfcore.native.yuv import rgb_from_i420
 from rfcore.wire.messages import Frame, Hello
 
 __all__ = [
+    "FieldTiles",
     "KeepLimits",
     "Recorder",
-    "RecordingRoom",
+    "RecordingQuota",
     "SessionRecording",
-    "TilesOfFields",
     "picture_name",
 ]
 
@@ -62,7 +62,7 @@ class KeepLimits:
 
 
 @dataclass(frozen=True)
-class TilesOfFields:
+class FieldTiles:
     """Where the tile of a field is, and what it is called: both by the field's id."""
 
     origin_of: Callable[[str], TileOrigin]
@@ -71,7 +71,7 @@ class TilesOfFields:
     """Empty for a field of no published tile."""
 
 
-class RecordingRoom:
+class RecordingQuota:
     """Counts the bytes of every part under ``root``, also those of earlier runs, and deletes.
 
     Used by one thread. What is in the folder and no part is neither counted nor deleted.
@@ -133,7 +133,7 @@ class RecordingRoom:
 
 
 @dataclass(frozen=True)
-class Waiting:
+class QueuedPicture:
     """One picture to keep; ``world_from_cam`` is None where the camera was lost."""
 
     camera: RecordedCamera
@@ -162,7 +162,7 @@ class Recorder:
         self,
         root: Path,
         limits: KeepLimits,
-        tiles: TilesOfFields,
+        tiles: FieldTiles,
         now_ms: Callable[[], int],
         on_failure: Callable[[Exception], None],
     ) -> None:
@@ -172,9 +172,9 @@ class Recorder:
         self._now_ms = now_ms
         self._on_failure = on_failure
         self._failed = False
-        self._room: RecordingRoom | None = None
+        self._room: RecordingQuota | None = None
         self._open: dict[RecordedCamera, OpenPart] = {}
-        self._queue: queue.Queue[Waiting | None] = queue.Queue(MAX_WAITING)
+        self._queue: queue.Queue[QueuedPicture | None] = queue.Queue(MAX_WAITING)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -193,7 +193,7 @@ class Recorder:
         self._queue.put(None)
         self._thread.join()
 
-    def _put(self, waiting: Waiting) -> None:
+    def _put(self, waiting: QueuedPicture) -> None:
         if not self._failed:
             self._queue.put(waiting)
 
@@ -208,18 +208,18 @@ class Recorder:
                 return
             self._attempt(lambda room, one=waiting: self._write(room, one))  # type: ignore[misc]
 
-    def _attempt(self, work: Callable[[RecordingRoom], object]) -> None:
+    def _attempt(self, work: Callable[[RecordingQuota], object]) -> None:
         if self._failed:
             return
         try:
             if self._room is None:
-                self._room = RecordingRoom(self._root, self._limits, self._tiles.name_of)
+                self._room = RecordingQuota(self._root, self._limits, self._tiles.name_of)
             work(self._room)
         except Exception as error:
             self._failed = True
             self._on_failure(error)
 
-    def _write(self, room: RecordingRoom, waiting: Waiting) -> None:
+    def _write(self, room: RecordingQuota, waiting: QueuedPicture) -> None:
         png = png_bytes(rgb_from_i420(waiting.picture))
         line = _line(waiting)
         room.make(len(png) + len(line), self._now_ms())
@@ -230,7 +230,7 @@ class Recorder:
         room.add(part, len(png) + len(line))
         self._open[waiting.camera] = OpenPart(part, waiting.frame.capture_time_ns)
 
-    def _part(self, room: RecordingRoom, waiting: Waiting) -> Path:
+    def _part(self, room: RecordingQuota, waiting: QueuedPicture) -> Path:
         """Return the folder to write to: a new one where the last is full or time went back."""
         camera, now_ms = waiting.camera, self._now_ms()
         part = self._open.get(camera)
@@ -259,7 +259,7 @@ class SessionRecording:
         session_id: str,
         hello: Hello,
         origins: Mapping[str, TileOrigin],
-        put: Callable[[Waiting], None],
+        put: Callable[[QueuedPicture], None],
     ) -> None:
         self._cameras = {
             camera.camera_id: RecordedCamera(
@@ -274,7 +274,9 @@ class SessionRecording:
         """Queue a picture; returns at once unless ``MAX_WAITING`` pictures wait for the disk."""
         pose = frame.pose
         world_from_cam = None if pose is None else self._origins[field_id].globalise(pose)
-        self._put(Waiting(self._cameras[frame.camera_id], frame, field_id, world_from_cam, picture))
+        self._put(
+            QueuedPicture(self._cameras[frame.camera_id], frame, field_id, world_from_cam, picture)
+        )
 
 
 def picture_name(frame: Frame) -> str:
@@ -283,7 +285,7 @@ def picture_name(frame: Frame) -> str:
     return f"{sequence:06}.png" if epoch == 0 else f"e{epoch:04}-{sequence:06}.png"
 
 
-def _line(waiting: Waiting) -> str:
+def _line(waiting: QueuedPicture) -> str:
     frame = waiting.frame
     return RecordedPicture(
         file=picture_name(frame),

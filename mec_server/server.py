@@ -49,14 +49,14 @@ from mec_server.metrics import BackgroundTask, ServerMetrics
 from mec_server.peers import ChargeRpcs, Slots
 from mec_server.proxies import Proxies
 from mec_server.reconstruction import OpenCameras, Tools, open_cameras
-from mec_server.recorder import KeepLimits, Recorder, TilesOfFields
+from mec_server.recorder import FieldTiles, KeepLimits, Recorder
 from mec_server.stream_decoders import ServerContext
 from mec_server.tile_history import TileHistory
 from mec_server.tile_learning import LearningJob
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.notices import StreetNotices
-from mec_server.twin.rendering import Classify, TwinViews
-from mec_server.twin.service import Sight, TwinService
+from mec_server.twin.rendering import Classify, ViewService
+from mec_server.twin.service import ConsumerAccess, TwinService
 from mec_server.twin.state import Twin
 from rfcore.errors import RfedgeError
 from rfcore.field import RadianceField
@@ -272,8 +272,8 @@ class EdgeServer:
         self._metrics.observe_ledger(entry, self._log_limiter)
         return entry
 
-    def _twin_views(self, twin: Twin, classify: Classify | None) -> TwinViews:
-        return TwinViews(
+    def _twin_views(self, twin: Twin, classify: Classify | None) -> ViewService:
+        return ViewService(
             twin,
             self._fields_of_a_thread,
             lambda: self._published.tiles,
@@ -500,7 +500,7 @@ class EdgeServer:
 
         self._follow(sweep, CONNECTIONS_EVERY_S, BackgroundTask.CONNECTIONS)
 
-    def _sight(self, context: grpc.aio.ServicerContext[Any, Any]) -> Sight:
+    def _sight(self, context: grpc.aio.ServicerContext[Any, Any]) -> ConsumerAccess:
         """Return what the peer of a call may see of the twin."""
         grant = self._guard.grant(context)
 
@@ -512,7 +512,7 @@ class EdgeServer:
             here = (tile.name for tile in self._published.tiles if field_id in tile.archive_ids)
             return self._guard.may_fetch(context, frozenset(here))
 
-        return Sight(covers, grant.check_vehicles, may_draw)
+        return ConsumerAccess(covers, grant.check_vehicles, may_draw)
 
     def _follow(
         self, work: Callable[[], Awaitable[object]], every_s: float, task: BackgroundTask
@@ -538,7 +538,7 @@ class EdgeServer:
         return Recorder(
             settings.folder,
             limits,
-            TilesOfFields(
+            FieldTiles(
                 lambda field_id: self._shelf.open(field_id).metadata.tile_origin,
                 lambda field_id: self._published.name_of(field_id),
             ),

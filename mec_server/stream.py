@@ -30,7 +30,7 @@ from mec_server.session import (
     StreamEnd,
 )
 from mec_server.stream_decoders import FrameResult, ServerContext, StreamDecoders
-from mec_server.twin.state import TwinView
+from mec_server.twin.state import ReceivedPicture
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
 from rfcore.wire.conventions import AGENT_PROCESS
@@ -416,7 +416,7 @@ class Stream:
         hello, session = self._session.hello, self._session
         if hello is None or session.closed is not None:
             return
-        shown = TwinView(
+        shown = ReceivedPicture(
             vehicle_id=hello.vehicle_id,
             session_id=session.session_id,
             frame=job.frame,

@@ -26,8 +26,8 @@ import numpy as np
 import structlog
 
 from mec_server.recorded_passes import (
+    RecordedPass,
     Recordings,
-    SeenPass,
     by_light,
     hour_of,
     light_of,
@@ -50,7 +50,7 @@ from rfcore.wire.tiles import Tile
 __all__ = [
     "CHECK_EVERY",
     "CHECK_FRAMES",
-    "Harm",
+    "BitsIncrease",
     "LearningJob",
     "LearningRounds",
     "percent_worse",
@@ -99,7 +99,7 @@ class LearningJob:
 
 
 @dataclass(frozen=True)
-class Harm:
+class BitsIncrease:
     """How many percent more bits a vehicle that is not recorded took for a field that was learnt
     than it would have for what this replaced; below 0: fewer."""
 
@@ -129,9 +129,9 @@ class LearningRounds:
     def __init__(self, job: LearningJob, now_ms: Callable[[], int]) -> None:
         self._job, self._now_ms = job, now_ms
         self._learners: dict[str, TileLearner] = {}
-        self._reports: SimpleQueue[Harm] = SimpleQueue()
+        self._reports: SimpleQueue[BitsIncrease] = SimpleQueue()
 
-    def report(self, harm: Harm) -> None:
+    def report(self, harm: BitsIncrease) -> None:
         """Take what the server found; may be called by another thread than ``run``."""
         self._reports.put(harm)
 
@@ -199,7 +199,7 @@ class TileLearner:
         for one in self._current():
             self._check(one)
 
-    def withdraw_reported(self, harm: Harm) -> None:
+    def withdraw_reported(self, harm: BitsIncrease) -> None:
         """Withdraw a current field that costs a vehicle bits which is not recorded; count it."""
         if harm.percent > self._job.settings().max_loss_percent:
             for one in self._current():
@@ -268,7 +268,7 @@ class TileLearner:
                 self._learn_light(versions.tile(self.name), light, of_light, watch)
 
     def _learn_light(
-        self, tile: Tile, light: str, group: Sequence[SeenPass], watch: Callable[[], None]
+        self, tile: Tile, light: str, group: Sequence[RecordedPass], watch: Callable[[], None]
     ) -> None:
         current = {"": tile.field_id, **{one.name: one.field_id for one in tile.lights}}
         replaced_id = current.get(light, tile.field_id)
@@ -353,7 +353,7 @@ class TileLearner:
         light: str,
         replaced_id: str,
         update: Update,
-        group: Sequence[SeenPass],
+        group: Sequence[RecordedPass],
         honest: Sequence[Pass],
     ) -> None:
         passes, identities = len(honest), len(_identities(honest))
@@ -412,7 +412,7 @@ class TileLearner:
 
     # --- recordings
 
-    def _tried(self, group: Sequence[SeenPass]) -> None:
+    def _tried(self, group: Sequence[RecordedPass]) -> None:
         there = {
             self._recordings.name_of(file) for file in self._recordings.files(self._job.max_age_s)
         }
@@ -429,7 +429,7 @@ class TileLearner:
             and self._recordings.age_s(file) >= self._job.quiet_s
         ]
 
-    def _seen_passes(self, files: Sequence[Path], versions: TileVersions) -> Iterator[SeenPass]:
+    def _seen_passes(self, files: Sequence[Path], versions: TileVersions) -> Iterator[RecordedPass]:
         tile = versions.tile(self.name)
         own = self._open(tile.field_id)
         fields = {"": own, **{one.name: self._open(one.field_id) for one in tile.other_lights}}
@@ -438,7 +438,7 @@ class TileLearner:
             if len(drive.pictures) >= FEWEST_FRAMES:
                 few = replace(drive, pictures=tuple(spread(drive.pictures, self._job.frames)))
                 first_ns = part.pictures[0].capture_time_ns
-                yield SeenPass(
+                yield RecordedPass(
                     self._recordings.name_of(part.file), few, first_ns, *light_of(few, fields)
                 )
 

@@ -58,8 +58,8 @@ from streetgen.scene_file import Scene, load_scene
 from streetgen.shots import Selection
 
 __all__ = [
-    "Found",
-    "SeenDrive",
+    "AnnotatedDrive",
+    "FoundVehicles",
     "dusk_rows",
     "dusk_scenes",
     "followed",
@@ -79,7 +79,7 @@ TEACHER_LEFT_M, TEACHER_HZ = 0.5, 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPicture:
+class AnnotatedPicture:
     """A picture of a drive, when it was taken, what the field shows there, and what vehicles are in
     it, by the truth."""
 
@@ -91,14 +91,14 @@ class SeenPicture:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenDrive:
+class AnnotatedDrive:
     """A drive against a field, and that field's ground."""
 
-    pictures: tuple[SeenPicture, ...]
+    pictures: tuple[AnnotatedPicture, ...]
     ground: FieldGround
 
     @staticmethod
-    def of(drive: Drive, field: RadianceField, truth: SceneTruth | None) -> SeenDrive:
+    def of(drive: Drive, field: RadianceField, truth: SceneTruth | None) -> AnnotatedDrive:
         """Read and render everything. ``truth`` None: no vehicles are there."""
         pictures = []
         for index, picture in enumerate(drive.pictures):
@@ -106,8 +106,8 @@ class SeenDrive:
             vehicles = () if truth is None else tuple(truth.vehicles(picture.camera, time_s))
             camera = picture.camera.rounded()
             view = field.render(camera)
-            pictures.append(SeenPicture(camera, time_s, picture.read(), view, vehicles))
-        return SeenDrive(tuple(pictures), FieldGround(field.render))
+            pictures.append(AnnotatedPicture(camera, time_s, picture.read(), view, vehicles))
+        return AnnotatedDrive(tuple(pictures), FieldGround(field.render))
 
     @property
     def seconds(self) -> float:
@@ -117,7 +117,7 @@ class SeenDrive:
 
 
 @dataclass
-class Found:
+class FoundVehicles:
     """How objects compare with the vehicles of a drive's pictures.
 
     ``errors_m``: of every object in every picture where there is a vehicle at all; ``false``: the
@@ -129,7 +129,7 @@ class Found:
     errors_m: list[float] = with_factory(default_factory=list)
     false: set[int] = with_factory(default_factory=set)
 
-    def take(self, picture: SeenPicture, objects: Sequence[FollowedObject]) -> None:
+    def take(self, picture: AnnotatedPicture, objects: Sequence[FollowedObject]) -> None:
         """Compare the confirmed objects after a picture."""
         places = [vehicle.footprint for vehicle in picture.vehicles]
         for each in objects:
@@ -146,7 +146,7 @@ class Found:
                 self.found += vehicle.number in found
 
 
-def _found_by(picture: SeenPicture, objects: Sequence[FollowedObject]) -> dict[int, int]:
+def _found_by(picture: AnnotatedPicture, objects: Sequence[FollowedObject]) -> dict[int, int]:
     """Return which vehicle is found by which object, one by one, the nearest first."""
     pairs = sorted(
         (distance_m, vehicle.number, each.object_id)
@@ -164,19 +164,19 @@ def _found_by(picture: SeenPicture, objects: Sequence[FollowedObject]) -> dict[i
 def object_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     """Return what is found of vehicles, with and without noise, and what where there are none."""
     vehicles, empty = Drive.given(asked.vehicles), Drive.given(asked.empty)
-    with_vehicles = SeenDrive.of(vehicles, field, SceneTruth(vehicles.scene))
-    nothing = SeenDrive.of(empty, field, None)
+    with_vehicles = AnnotatedDrive.of(vehicles, field, SceneTruth(vehicles.scene))
+    nothing = AnnotatedDrive.of(empty, field, None)
     rows = []
     for name, sigma in (("", 0.0), (f", noise {NOISE_SIGMA:g}", NOISE_SIGMA)):
         found = followed(with_vehicles, sigma)
         rows += _rows_of_found(f"vehicles{name}", found, with_vehicles.seconds)
         rows.append(_row_of_empty(f"false ones where nothing stands{name}", nothing, sigma))
     if asked.long_empty:
-        nothing = SeenDrive.of(Drive.given(asked.long_empty), field, None)
+        nothing = AnnotatedDrive.of(Drive.given(asked.long_empty), field, None)
     return [*rows, empty_minute(nothing)]
 
 
-def empty_minute(drive: SeenDrive) -> WorldRow:
+def empty_minute(drive: AnnotatedDrive) -> WorldRow:
     """Return how many objects a minute of an empty street has."""
     drives = math.ceil(MINUTE_S / drive.seconds)
     false = sum(len(followed(drive, NOISE_SIGMA, seed).false) for seed in range(1, drives + 1))
@@ -192,20 +192,20 @@ def empty_minute(drive: SeenDrive) -> WorldRow:
     )
 
 
-def followed(drive: SeenDrive, sigma: float, seed: int = NOISE_SEED) -> Found:
+def followed(drive: AnnotatedDrive, sigma: float, seed: int = NOISE_SEED) -> FoundVehicles:
     """Return how what is followed through a drive, with noise of ``sigma`` levels added, compares
     with the truth."""
-    tracker, found = ObjectTracker(), Found()
+    tracker, found = ObjectTracker(), FoundVehicles()
     rng = np.random.default_rng(seed)
     sent = [noisy(picture.rgb, sigma, rng) for picture in drive.pictures]
     for picture, rgb in zip(drive.pictures, received(drive.pictures, sent), strict=True):
         live = live_picture(picture.camera, rgb, picture.view)
-        tracker.take(detect(live, drive.ground), CAMERA, picture.time_s, live.lacks)
+        tracker.take(detect(live, drive.ground), CAMERA, picture.time_s, live.rules_out)
         found.take(picture, tracker.confirmed(picture.time_s))
     return found
 
 
-def received(pictures: Sequence[SeenPicture], sent: Sequence[Rgb]) -> Iterator[Rgb]:
+def received(pictures: Sequence[AnnotatedPicture], sent: Sequence[Rgb]) -> Iterator[Rgb]:
     """Yield what a server decodes of the pictures ``sent`` from there by one camera."""
     k = pictures[0].camera.intrinsics
     encoder = DeltaEncoder(CodecConfig(k.width_px, k.height_px))
@@ -224,13 +224,13 @@ def noisy(rgb: NDArray[np.uint8], sigma: float, rng: np.random.Generator) -> NDA
     return np.clip(np.rint(rgb + rng.normal(scale=sigma, size=rgb.shape)), 0, 255).astype(np.uint8)
 
 
-def _row_of_empty(case: str, drive: SeenDrive, sigma: float) -> WorldRow:
+def _row_of_empty(case: str, drive: AnnotatedDrive, sigma: float) -> WorldRow:
     false = len(followed(drive, sigma).false)
     told = f"{false} in {drive.seconds:.1f} s"
     return WorldRow("objects", case, "<= 1 a minute", told, false <= drive.seconds / 60)
 
 
-def _rows_of_found(name: str, found: Found, seconds: float) -> list[WorldRow]:
+def _rows_of_found(name: str, found: FoundVehicles, seconds: float) -> list[WorldRow]:
     errors_m = np.array(found.errors_m or [np.nan])
     median_m, p95_m = (float(np.nanpercentile(errors_m, q)) for q in (50, 95))
     share = found.found / max(1, found.to_find)
@@ -306,9 +306,9 @@ def dusk_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     evening = _evening_field(asked.field, field, teacher, asked.work, console)
     empty = Drive(_rendered(scenes.empty, asked.work, console).pictures, paths[0])
     vehicles = Drive(_rendered(scenes.vehicles, asked.work, console).pictures, paths[1])
-    with_vehicles = SeenDrive.of(vehicles, evening, SceneTruth(paths[1]))
+    with_vehicles = AnnotatedDrive.of(vehicles, evening, SceneTruth(paths[1]))
     rows = _rows_of_found("dusk, vehicles", followed(with_vehicles, 0.0), with_vehicles.seconds)
-    nothing = SeenDrive.of(empty, evening, None)
+    nothing = AnnotatedDrive.of(empty, evening, None)
     return [*rows, _row_of_empty("dusk, false ones where nothing stands", nothing, 0.0)]
 
 

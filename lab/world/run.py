@@ -19,7 +19,7 @@ from rich.console import Console
 from lab.live.showing import TwinBed, ingest_latencies_ms
 from lab.servers.cases import WorldRow, print_world
 from lab.world import EvalWorld
-from lab.world.objects import SeenPicture, dusk_rows, object_rows, received
+from lab.world.objects import AnnotatedPicture, dusk_rows, object_rows, received
 from lab.world.truth import Drive, SceneTruth, aside
 from mec_server.event_loop import work_when_idle
 from mec_server.learner import ONE_THREAD
@@ -139,7 +139,7 @@ def _received(drive: Drive, field: RadianceField) -> Iterator[LivePicture]:
     for index, picture in enumerate(drive.pictures):
         camera = picture.camera.rounded()
         view = field.render(camera)
-        pictures.append(SeenPicture(camera, drive.time_s(index), picture.read(), view, ()))
+        pictures.append(AnnotatedPicture(camera, drive.time_s(index), picture.read(), view, ()))
     for each, rgb in zip(pictures, received(pictures, [p.rgb for p in pictures]), strict=True):
         yield live_picture(each.camera, rgb, each.view)
 

@@ -30,7 +30,7 @@ from mec_server.decoding.protocol import (
     MEMORY_BYTES,
     NUMBER,
     OUTPUT_AT,
-    Command,
+    DecoderCommand,
     request_from_bytes,
 )
 from rfcore.codec.h264.ffmpeg import H264Decoder
@@ -67,18 +67,18 @@ class DecoderChild:
             return FAILED + str(error).encode()[: MAX_ANSWER_BYTES - 1]
         return DONE
 
-    def _obey(self, command: Command, numbers: Sequence[int]) -> None:
-        if command is Command.OPEN:
+    def _obey(self, command: DecoderCommand, numbers: Sequence[int]) -> None:
+        if command is DecoderCommand.OPEN:
             width_px, height_px = numbers
             self._decoder = H264Decoder((width_px, height_px))
             return
         if self._decoder is None:
             raise CodecError("decoder process: nothing is open")
-        if command is Command.RESET:
+        if command is DecoderCommand.RESET:
             self._decoder.reset()
             return
         units = list(self._units(numbers))
-        wanted = units.pop() if command is Command.DECODE else None
+        wanted = units.pop() if command is DecoderCommand.DECODE else None
         for unit in units:
             self._decoder.feed(unit)
         if wanted is not None:

@@ -19,7 +19,7 @@ import structlog
 
 from mec_server.config import DecoderKind
 from mec_server.decoding.pool import DecoderPool
-from mec_server.decoding.process import DecoderLost, LossCause, Waiting
+from mec_server.decoding.process import DecoderLost, LossCause, WaitContext
 from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.splice import PictureDecoder
@@ -84,7 +84,7 @@ class Decoders:
         count_loss: Callable[[LossCause], None],
         start_failed: Callable[[Exception], None],
         limiter: LogLimiter,
-        waiting: Waiting = nullcontext,
+        waiting: WaitContext = nullcontext,
     ) -> None:
         self.kind = settings.kind
         if self.kind is DecoderKind.AUTO and not settings.reachable:

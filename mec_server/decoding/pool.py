@@ -17,10 +17,10 @@ from mec_server.decoding.process import (
     DecoderLost,
     DecoderProcess,
     ForkServer,
-    Retired,
-    Waiting,
+    ForkServerRetired,
+    WaitContext,
 )
-from mec_server.decoding.protocol import INPUT_BYTES, Command
+from mec_server.decoding.protocol import INPUT_BYTES, DecoderCommand
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
 from rfcore.image import I420
@@ -44,7 +44,7 @@ class DecoderPool:
         program: ConfinedProgram,
         lost: Callable[[DecoderLost], None],
         start_failed: Callable[[Exception], None],
-        waiting: Waiting = nullcontext,
+        waiting: WaitContext = nullcontext,
     ) -> None:
         self.waiting = waiting
         self._lost = lost
@@ -107,7 +107,7 @@ class DecoderPool:
         """Runs on the starter's thread."""
         process: DecoderProcess | None = None
         while process is None:
-            with suppress(Retired):  # one of its decoders was lost since it was looked at
+            with suppress(ForkServerRetired):  # one of its decoders was lost since it was looked at
                 process = DecoderProcess(self._usable_forks())
         process.wait_until_ready()
         return process
@@ -140,7 +140,7 @@ class ChildDecoder:
         """Decode one access unit of one whole picture, or raise ``CodecError``."""
         with self._lock:
             process = self._stage_unit(access_unit)
-            self._request(process, Command.DECODE, *self._take_staged())
+            self._request(process, DecoderCommand.DECODE, *self._take_staged())
             width, height = self._size_px
             return I420.unpacked(self._size_px, process.take(width * height * 3 // 2))
 
@@ -154,7 +154,7 @@ class ChildDecoder:
         with self._lock:
             self._staged_bytes.clear()
             if self._process is not None:
-                self._request(self._process, Command.RESET)
+                self._request(self._process, DecoderCommand.RESET)
 
     def close(self) -> None:
         """End the process; nothing can be decoded any more."""
@@ -172,7 +172,7 @@ class ChildDecoder:
         if size > INPUT_BYTES:
             raise CodecError(f"access unit of {size} bytes exceeds {INPUT_BYTES}")
         if len(self._staged_bytes) == MAX_STAGED or sum(self._staged_bytes) + size > INPUT_BYTES:
-            self._request(process, Command.FEED, *self._take_staged())
+            self._request(process, DecoderCommand.FEED, *self._take_staged())
         process.put(access_unit, sum(self._staged_bytes))
         self._staged_bytes.append(size)
         return process
@@ -190,10 +190,10 @@ class ChildDecoder:
             process = self._pool.take()
         except RfedgeError as error:
             raise CodecError(str(error)) from error
-        self._request(process, Command.OPEN, *self._size_px)
+        self._request(process, DecoderCommand.OPEN, *self._size_px)
         return process
 
-    def _request(self, process: DecoderProcess, command: Command, *numbers: int) -> None:
+    def _request(self, process: DecoderProcess, command: DecoderCommand, *numbers: int) -> None:
         try:
             process.ask(command, *numbers, waiting=self._pool.waiting)
         except DecoderLost as lost:

@@ -32,13 +32,20 @@ from mec_server.decoding.protocol import (
     MEMORY_BYTES,
     NUMBER,
     OUTPUT_AT,
-    Command,
+    DecoderCommand,
     request_to_bytes,
 )
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
 
-__all__ = ["DecoderLost", "DecoderProcess", "ForkServer", "LossCause", "Retired", "Waiting"]
+__all__ = [
+    "DecoderLost",
+    "DecoderProcess",
+    "ForkServer",
+    "ForkServerRetired",
+    "LossCause",
+    "WaitContext",
+]
 
 START_S = 20.0
 """Time limit of the fork server's start, 0.3 s on an idle machine and more on one that swaps or is
@@ -51,7 +58,7 @@ PATIENCE_S = 0.03
 """An answer that takes longer, as one of 1080p may, is waited for without holding a worker of the
 server: a decoder that hangs costs others no more."""
 
-Waiting = Callable[[], AbstractContextManager[None]]
+WaitContext = Callable[[], AbstractContextManager[None]]
 """Makes a context in which a thread waits, so that another one may work in its place."""
 
 SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
@@ -74,7 +81,7 @@ class DecoderLost(CodecError):
         self.pid = pid
 
 
-class Retired(RfedgeError):
+class ForkServerRetired(RfedgeError):
     """A fork server forks no more: one of its decoders was lost."""
 
 
@@ -117,11 +124,11 @@ class ForkServer:
         """Fork a decoder process with ``descriptors``: its socket, memory and file for errors.
 
         Returns the number to reap it by and its pidfd, which is the caller's to close. Raises
-        ``Retired``, or ``RfedgeError``.
+        ``ForkServerRetired``, or ``RfedgeError``.
         """
         with self._lock:
             if self._retired:
-                raise Retired("fork server of decoders: one of them was lost")
+                raise ForkServerRetired("fork server of decoders: one of them was lost")
             answer, received = self._ask(b" ", descriptors)
             self._in_use += 1
         (pidfd,) = received
@@ -221,7 +228,9 @@ class DecoderProcess:
         """Whether it runs."""
         return not _is_readable(self._pidfd, 0.0)
 
-    def ask(self, command: Command, *numbers: int, waiting: Waiting = nullcontext) -> None:
+    def ask(
+        self, command: DecoderCommand, *numbers: int, waiting: WaitContext = nullcontext
+    ) -> None:
         """Send a request and wait for its answer, for long in the context of ``waiting``.
 
         Raises ``DecoderLost``, or ``CodecError`` if FFmpeg refuses.

@@ -30,7 +30,7 @@ __all__ = [
     "MEMORY_BYTES",
     "NUMBER",
     "OUTPUT_AT",
-    "Command",
+    "DecoderCommand",
     "request_from_bytes",
     "request_to_bytes",
 ]
@@ -50,7 +50,7 @@ MAX_ANSWER_BYTES = 1024
 MAX_REQUEST_BYTES = 1 + 4 * 16
 
 
-class Command(IntEnum):
+class DecoderCommand(IntEnum):
     """What a decoder process can be asked for: OPEN with width and height, RESET, and with the
     lengths of access units FEED, which decodes them, and DECODE, which also returns the last."""
 
@@ -60,12 +60,12 @@ class Command(IntEnum):
     RESET = 4
 
 
-def request_to_bytes(command: Command, *numbers: int) -> bytes:
+def request_to_bytes(command: DecoderCommand, *numbers: int) -> bytes:
     """Return a request as it is sent."""
     return struct.pack(f"<B{len(numbers)}I", command, *numbers)
 
 
-def request_from_bytes(data: bytes) -> tuple[Command, tuple[int, ...]]:
+def request_from_bytes(data: bytes) -> tuple[DecoderCommand, tuple[int, ...]]:
     """Return the command and its numbers."""
     command, *numbers = struct.unpack(f"<B{(len(data) - 1) // 4}I", data)
-    return Command(command), tuple(numbers)
+    return DecoderCommand(command), tuple(numbers)

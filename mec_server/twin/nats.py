@@ -19,15 +19,15 @@ import structlog
 
 from mec_server.nats import NatsLink, places_bucket, together
 from mec_server.twin.metrics import TwinMetrics
-from mec_server.twin.service import TwinPictures, picture_message
-from mec_server.twin.state import Twin, TwinView
+from mec_server.twin.service import PictureEncoder, picture_message
+from mec_server.twin.state import ReceivedPicture, Twin
 from rfcore.errors import ProtocolError
 from rfcore.extras import needs
 from rfcore.perception.objects import CameraKey
 from rfcore.wire.nats import (
     PLACE_HEADER,
     WANTED_S,
-    VehiclePlace,
+    VehicleLocation,
     key_of,
     picture_subject,
     wanted_encoding,
@@ -64,7 +64,7 @@ class TwinPublisher:
         link: NatsLink,
         name: str,
         twin: Twin,
-        pictures: TwinPictures,
+        pictures: PictureEncoder,
         tiles: Callable[[], tuple[Tile, ...]],
         metrics: TwinMetrics,
     ) -> None:
@@ -77,8 +77,8 @@ class TwinPublisher:
         self._arrived = asyncio.Event()
         every = Subscription(encoding=PictureEncoding.NONE)
         self._mailbox = twin.watch(every, self._arrived.set, counts_misses=False)
-        self._newest: dict[CameraKey, TwinView] = {}
-        self._again: OrderedDict[CameraKey, TwinView] = OrderedDict()
+        self._newest: dict[CameraKey, ReceivedPicture] = {}
+        self._again: OrderedDict[CameraKey, ReceivedPicture] = OrderedDict()
         self._wanted: dict[PictureEncoding, float] = {}
         self._too_large = 0
         metrics.nats_missed = lambda: self._mailbox.missed + self._too_large
@@ -132,17 +132,17 @@ class TwinPublisher:
             else:
                 await self._publish_view(client, entry)
 
-    def _take(self) -> TwinView | Departure | None:
+    def _take(self) -> ReceivedPicture | Departure | None:
         """Return what is to be published next."""
         entry = self._mailbox.take()
-        if isinstance(entry, TwinView):
+        if isinstance(entry, ReceivedPicture):
             self._newest[entry.key] = entry
             self._again.pop(entry.key, None)
         if entry is None and self._again:
             return self._again.popitem(last=False)[1]
         return entry
 
-    async def _publish_view(self, client: Client, view: TwinView) -> None:
+    async def _publish_view(self, client: Client, view: ReceivedPicture) -> None:
         headers = {PLACE_HEADER: self._place(view).encode().decode()}
         for encoding in self._encodings():
             data = await self._pictures.bytes_of(view, encoding)
@@ -170,10 +170,10 @@ class TwinPublisher:
         for encoding in self._encodings():
             await client.publish(picture_subject(encoding, *key), body, headers=headers)
 
-    def _place(self, view: TwinView) -> VehiclePlace:
+    def _place(self, view: ReceivedPicture) -> VehicleLocation:
         tiles = (tile for tile in self._tiles() if view.field_id in tile.archive_ids)
         tile = next(tiles, None)
-        return VehiclePlace(
+        return VehicleLocation(
             vehicle_id=view.vehicle_id,
             server=self._name,
             session_id=view.session_id,
@@ -183,9 +183,9 @@ class TwinPublisher:
             field_id=view.field_id if tile is None else tile.field_id,
         )
 
-    def _places(self) -> Mapping[str, VehiclePlace]:
+    def _places(self) -> Mapping[str, VehicleLocation]:
         """Return where the vehicles of this server are, each in its newest session."""
-        places: dict[str, VehiclePlace] = {}
+        places: dict[str, VehicleLocation] = {}
         for view in self._newest.values():
             place = self._place(view)
             known = places.get(view.vehicle_id)
@@ -205,9 +205,9 @@ class PlaceRecords:
 
     def __init__(self, bucket: KeyValue) -> None:
         self._bucket = bucket
-        self._written: dict[str, tuple[VehiclePlace, int]] = {}
+        self._written: dict[str, tuple[VehicleLocation, int]] = {}
 
-    async def write(self, places: Mapping[str, VehiclePlace]) -> None:
+    async def write(self, places: Mapping[str, VehicleLocation]) -> None:
         """Write ``places``, and remove what was written before of vehicles that are not there."""
         for vehicle_id in self._written.keys() - places.keys():
             _, revision = self._written.pop(vehicle_id)
@@ -216,7 +216,7 @@ class PlaceRecords:
         for place in places.values():
             await self._put(place)
 
-    async def _put(self, place: VehiclePlace) -> None:
+    async def _put(self, place: VehicleLocation) -> None:
         """Write one place in place of what this server wrote, or of an older one."""
         key, value = key_of(place.vehicle_id), place.encode()
         _, revision = self._written.pop(place.vehicle_id, (place, 0))
@@ -239,10 +239,10 @@ class PlaceRecords:
             revision = await self._bucket.create(key, value)
         return revision
 
-    async def _read(self, key: str) -> tuple[VehiclePlace, int] | None:
+    async def _read(self, key: str) -> tuple[VehicleLocation, int] | None:
         """Return what is written and its revision; ``None`` for nothing that can be read."""
         try:
             entry = await self._bucket.get(key)
-            return VehiclePlace.decode(entry.value or b""), entry.revision or 0
+            return VehicleLocation.decode(entry.value or b""), entry.revision or 0
         except (KeyNotFoundError, ProtocolError):
             return None

@@ -32,8 +32,8 @@ from typing import Protocol
 import numpy as np
 
 from mec_server.twin.metrics import TwinMetrics
-from mec_server.twin.rendering import Place, TwinViews, place_of
-from mec_server.twin.state import Twin, TwinView
+from mec_server.twin.rendering import ViewedTile, ViewService, viewed_tile
+from mec_server.twin.state import ReceivedPicture, Twin
 from rfcore.camera import Camera, Pose
 from rfcore.errors import LimitExceeded
 from rfcore.perception.objects import FollowedObject, ObjectTracker
@@ -47,7 +47,7 @@ __all__ = [
     "OwnCamera",
     "StreamNotices",
     "StreetNotices",
-    "Whereabouts",
+    "VehiclePosition",
     "field_changes",
 ]
 
@@ -108,7 +108,7 @@ class OwnCamera:
     velocity_mps: Vec3
 
     @staticmethod
-    def of(views: Sequence[TwinView]) -> OwnCamera:
+    def of(views: Sequence[ReceivedPicture]) -> OwnCamera:
         """Return that of one camera's pictures, all of a known pose, the oldest first."""
         newest = views[-1]
         at_m, velocity_mps = _place_of(newest), (0.0, 0.0, 0.0)
@@ -137,27 +137,29 @@ class OwnCamera:
 
 
 @dataclass(frozen=True)
-class Whereabouts:
+class VehiclePosition:
     """Where a vehicle is: its cameras, the one of its newest picture first; and where ahead is."""
 
     cameras: tuple[OwnCamera, ...]
     ahead: Vec3
 
     @staticmethod
-    def of(cameras: Sequence[Sequence[TwinView]], camera_ids: Sequence[str]) -> Whereabouts:
+    def of(
+        cameras: Sequence[Sequence[ReceivedPicture]], camera_ids: Sequence[str]
+    ) -> VehiclePosition:
         """Return those of a vehicle by the pictures of its cameras, at least one of one, all of
         known poses, the oldest first; ``camera_ids``: in the order of its Hello."""
         newest_first = sorted(cameras, key=lambda views: -views[-1].captured_s)
         own = tuple(OwnCamera.of(views) for views in newest_first)
         way = own[0].velocity_mps
         if any(way):
-            return Whereabouts(own, way)
+            return VehiclePosition(own, way)
         order = (FRONT, *camera_ids, *(views[-1].frame.camera_id for views in newest_first))
         by_id = {views[-1].frame.camera_id: views[-1] for views in cameras}
         pose = _pose_of(next(by_id[name] for name in order if name in by_id))
         origin_m, on_axis_m = pose.apply((0.0, 0.0, 0.0)), pose.apply((0.0, 0.0, 1.0))
         x, y, z = (a - b for a, b in zip(on_axis_m, origin_m, strict=True))
-        return Whereabouts(own, (x, y, z))
+        return VehiclePosition(own, (x, y, z))
 
     def distance_ahead_m(self, each: FollowedObject, now: float) -> float | None:
         """Return how far an object is in front of the vehicle; ``None`` if it is behind it, out of
@@ -172,17 +174,17 @@ class Whereabouts:
         return distance_m
 
 
-def _pose_of(view: TwinView) -> Pose:
+def _pose_of(view: ReceivedPicture) -> Pose:
     assert view.frame.pose is not None
     return view.frame.pose
 
 
-def _place_of(view: TwinView) -> Vec3:
+def _place_of(view: ReceivedPicture) -> Vec3:
     return _pose_of(view).translation_m
 
 
 @dataclass
-class _Told:
+class _SentNotice:
     notice_id: int
     at_s: float
     seen_s: float
@@ -196,12 +198,12 @@ class StreamNotices:
 
     def __init__(self, vehicle_id: str) -> None:
         self._vehicle_id = vehicle_id
-        self._told: dict[tuple[str, int], _Told] = {}
+        self._told: dict[tuple[str, int], _SentNotice] = {}
         self._next_id = 1
         self._recent_s: deque[float] = deque(maxlen=MOST_PER_S)
 
     def about_objects(
-        self, field_id: str, own: Whereabouts, objects: Iterable[FollowedObject], now: float
+        self, field_id: str, own: VehiclePosition, objects: Iterable[FollowedObject], now: float
     ) -> list[StreetNotice]:
         """Return what the vehicle, which is at ``own``, is to be told now."""
         ahead = []
@@ -229,10 +231,12 @@ class StreamNotices:
     def _may_tell(self, now: float) -> bool:
         return len(self._recent_s) < MOST_PER_S or now - self._recent_s[0] >= 1.0
 
-    def _note(self, key: tuple[str, int], told: _Told | None, seen_s: float, now: float) -> int:
+    def _note(
+        self, key: tuple[str, int], told: _SentNotice | None, seen_s: float, now: float
+    ) -> int:
         self._recent_s.append(now)
         notice_id = self._new_id() if told is None else told.notice_id
-        self._told[key] = _Told(notice_id, now, seen_s)
+        self._told[key] = _SentNotice(notice_id, now, seen_s)
         return notice_id
 
     def _new_id(self) -> int:
@@ -289,7 +293,7 @@ class StreetNotices:
     def __init__(
         self,
         twin: Twin,
-        views: TwinViews,
+        views: ViewService,
         takers: Callable[[], Sequence[NoticeTaker]],
         tiles: Callable[[], tuple[Tile, ...]],
         metrics: TwinMetrics,
@@ -313,11 +317,11 @@ class StreetNotices:
         self._is_looking = True
         for taker in self._takers():
             for field_id in taker.field_ids:
-                self._views.prepare_glances(self._place_of(field_id), NOTICES_IDENTITY)
+                self._views.prepare(self._place_of(field_id), NOTICES_IDENTITY)
         try:
             while self._takers():
                 entry = mailbox.take()
-                if isinstance(entry, TwinView):
+                if isinstance(entry, ReceivedPicture):
                     await self._look_at(entry)
                 elif entry is None:
                     arrived.clear()
@@ -333,10 +337,10 @@ class StreetNotices:
     def expect(self, field_id: str, camera: Camera) -> None:
         """Prepare for a picture of ``camera``, coded against a field, that is being decoded."""
         if self._is_looking:
-            self._views.expect_glance(camera, self._place_of(field_id), NOTICES_IDENTITY)
+            self._views.expect_picture(camera, self._place_of(field_id), NOTICES_IDENTITY)
 
-    def _place_of(self, field_id: str) -> Place:
-        return place_of(ObjectsRequest(field_id=field_id), self._tiles())
+    def _place_of(self, field_id: str) -> ViewedTile:
+        return viewed_tile(ObjectsRequest(field_id=field_id), self._tiles())
 
     def fields_changed(self, before: Sequence[Tile], after: Sequence[Tile]) -> None:
         """Tell the vehicles of a tile that it has a new field."""
@@ -345,7 +349,7 @@ class StreetNotices:
                 if taker.field_ids & tile.archive_ids:
                     self._tell(taker, self._stream(taker).about_field(change))
 
-    async def _look_at(self, seen: TwinView) -> None:
+    async def _look_at(self, seen: ReceivedPicture) -> None:
         """Find what a picture shows, and tell those whom it concerns."""
         place = self._place_of(seen.field_id)
         takers = [taker for taker in self._takers() if taker.field_ids & place.field_ids]
@@ -353,11 +357,11 @@ class StreetNotices:
             self._trackers.pop(place.field_ids, None)
             return
         try:
-            glance = await self._views.glance(seen, place, NOTICES_IDENTITY)
+            found = await self._views.objects_in(seen, place, NOTICES_IDENTITY)
         except LimitExceeded:
             return
         tracker = self._trackers.setdefault(place.field_ids, ObjectTracker())
-        tracker.take(glance.detections, seen.key, seen.captured_s, glance.lacks, glance.labels)
+        tracker.take(found.detections, seen.key, seen.captured_s, found.rules_out, found.labels)
         now = time.monotonic()
         objects = [
             each
@@ -369,7 +373,7 @@ class StreetNotices:
             self._tell_of(taker, place, objects, now)
 
     def _tell_of(
-        self, taker: NoticeTaker, place: Place, objects: Sequence[FollowedObject], now: float
+        self, taker: NoticeTaker, place: ViewedTile, objects: Sequence[FollowedObject], now: float
     ) -> None:
         cameras = [
             [view for view in views if view.frame.pose is not None]
@@ -379,7 +383,7 @@ class StreetNotices:
         ]
         if not cameras:
             return
-        stream, own = self._stream(taker), Whereabouts.of(cameras, taker.camera_ids)
+        stream, own = self._stream(taker), VehiclePosition.of(cameras, taker.camera_ids)
         for notice in stream.about_objects(place.field_id, own, objects, now):
             self._tell(taker, notice)
 

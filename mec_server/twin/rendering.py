@@ -27,7 +27,7 @@ import numpy as np
 from mec_server.event_loop import Workers, give_way, work_when_idle
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
-from mec_server.twin.state import Covers, Twin, TwinView
+from mec_server.twin.state import Covers, ReceivedPicture, Twin
 from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded
 from rfcore.field import RadianceField
@@ -44,7 +44,7 @@ from rfcore.perception.composition import (
 )
 from rfcore.perception.contacts import Detection, cut_out
 from rfcore.perception.ground import FieldGround
-from rfcore.perception.objects import CameraKey, Lacks, lacks_nothing
+from rfcore.perception.objects import CameraKey, RulesOut, rules_nothing_out
 from rfcore.views import View
 from rfcore.wire.checks import check_label, shown
 from rfcore.wire.tiles import Tile
@@ -57,7 +57,7 @@ from rfcore.wire.twin_render import (
     ViewRequest,
 )
 
-__all__ = ["Classify", "Glance", "Place", "TwinViews", "check_inside", "place_of"]
+__all__ = ["Classify", "PictureObjects", "ViewService", "ViewedTile", "check_inside", "viewed_tile"]
 
 R = TypeVar("R")
 OpenField = Callable[[str], RadianceField]
@@ -84,7 +84,7 @@ INSIDE_M, INSIDE_SHARE = 0.3, 0.9
 
 
 @dataclass(frozen=True)
-class Place:
+class ViewedTile:
     """A field to draw, and every field that pictures of the same ground may be coded against.
     ``world``: what poses and objects are relative to, None for the field's origin."""
 
@@ -93,17 +93,17 @@ class Place:
     world: TileOrigin | None = None
 
 
-def place_of(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) -> Place:
+def viewed_tile(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) -> ViewedTile:
     """Return what ``request`` names; raise ``InvalidInput`` for a tile that is not published, or a
     place that is on none."""
     if request.place is not None:
         tile = _tile_at(request.place, tiles)
-        return Place(tile.field_id, tile.archive_ids, request.place)
+        return ViewedTile(tile.field_id, tile.archive_ids, request.place)
     for tile in tiles:
         if request.tile == tile.name or request.field_id in tile.archive_ids:
-            return Place(request.field_id or tile.field_id, tile.archive_ids)
+            return ViewedTile(request.field_id or tile.field_id, tile.archive_ids)
     if request.field_id:
-        return Place(request.field_id, frozenset((request.field_id,)))
+        return ViewedTile(request.field_id, frozenset((request.field_id,)))
     here = ", ".join(tile.name for tile in tiles) or "none; name a field_id"
     raise InvalidInput("tile", f"{shown(request.tile)} is not published here; published: {here}")
 
@@ -132,22 +132,22 @@ def _area_of(tile: Tile) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Glance:
+class PictureObjects:
     """What a picture says of things that the field does not have: those it shows, and of which it
     says that they are not there. ``origin_m``: of the field, relative to the place's ``world``;
     ``labels``: what a detector calls each of them, none without one."""
 
     detections: list[Detection]
-    lacks: Lacks = lacks_nothing
+    rules_out: RulesOut = rules_nothing_out
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     labels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class _LookedAt:
+class _AnalysedPicture:
     """A picture, what it changes in a field, and the things in it."""
 
-    seen: TwinView
+    seen: ReceivedPicture
     live: LivePicture
     detections: list[Detection]
 
@@ -169,14 +169,14 @@ class _FieldThread:
         return ground
 
 
-class _KeptLooks:
+class _AnalysisCache:
     """What the newest pictures change in fields, for all threads."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[CameraKey, str], _LookedAt] = OrderedDict()
+        self._kept: OrderedDict[tuple[CameraKey, str], _AnalysedPicture] = OrderedDict()
         self._lock = Lock()
 
-    def of(self, seen: TwinView, field_id: str) -> _LookedAt | None:
+    def of(self, seen: ReceivedPicture, field_id: str) -> _AnalysedPicture | None:
         """Return what was kept of ``seen``, None if nothing was."""
         with self._lock:
             kept = self._kept.get((seen.key, field_id))
@@ -185,7 +185,7 @@ class _KeptLooks:
             self._kept.move_to_end((seen.key, field_id))
         return kept
 
-    def keep(self, looked_at: _LookedAt, field_id: str) -> None:
+    def keep(self, looked_at: _AnalysedPicture, field_id: str) -> None:
         """Keep what was found, in place of what its camera showed before."""
         with self._lock:
             self._kept[looked_at.seen.key, field_id] = looked_at
@@ -194,7 +194,7 @@ class _KeptLooks:
                 self._kept.popitem(last=False)
 
 
-class TwinViews:
+class ViewService:
     """Composes views of ``twin``, and finds the things in its pictures.
 
     ``open_fields`` returns, for each thread, what opens fields that only this thread uses;
@@ -219,7 +219,7 @@ class TwinViews:
         looks = Workers(1, failed, "looks", begin=partial(give_way, LOOKS_NICE))
         self._composing = _FieldThread(views, open_fields())
         self._looking = _FieldThread(looks, open_fields())
-        self._kept = _KeptLooks()
+        self._kept = _AnalysisCache()
         self._ahead = 0
 
     def close(self) -> None:
@@ -260,22 +260,24 @@ class TwinViews:
         work = partial(self._composed, request, place, pictures, now - ago_s)
         return await self._on_thread(self._composing, identity, work)
 
-    async def glance(self, seen: TwinView, place: Place, identity: str) -> Glance:
+    async def objects_in(
+        self, seen: ReceivedPicture, place: ViewedTile, identity: str
+    ) -> PictureObjects:
         """Return what a picture shows that the field of ``place`` does not have; nothing for one
         without a pose.
 
         Raises ``LimitExceeded`` while ``identity`` has spent its worker time.
         """
         if seen.frame.pose is None:
-            return Glance([])
+            return PictureObjects([])
         compute = partial(self._detected, seen, place)
         return await self._on_thread(self._looking, identity, compute)
 
-    def prepare_glances(self, place: Place, identity: str) -> None:
+    def prepare(self, place: ViewedTile, identity: str) -> None:
         """Open the field of ``place`` and draw it once, so that the first glance is not late."""
         self._look_ahead(partial(self._warmed_up, place), identity)
 
-    def expect_glance(self, camera: Camera, place: Place, identity: str) -> None:
+    def expect_picture(self, camera: Camera, place: ViewedTile, identity: str) -> None:
         """Draw what a glance at a picture of ``camera`` will need of the field's ground, while the
         picture is being decoded: a place that was not looked at takes as long as that."""
         self._look_ahead(partial(self._ground_ahead, camera, place), identity)
@@ -300,9 +302,9 @@ class TwinViews:
 
     def place(
         self, request: ViewRequest | ObjectsRequest, may_draw: Callable[[str], bool]
-    ) -> Place:
+    ) -> ViewedTile:
         """Return where to look; raise ``InvalidInput`` or ``AccessDenied``."""
-        place = place_of(request, self._tiles())
+        place = viewed_tile(request, self._tiles())
         if not may_draw(place.field_id):
             raise AccessDenied("this certificate may not see that tile; ask the operator")
         return place
@@ -347,7 +349,11 @@ class TwinViews:
         return time.monotonic() - started, result
 
     def _composed(
-        self, request: ViewRequest, place: Place, pictures: list[TwinView], moment_s: float
+        self,
+        request: ViewRequest,
+        place: ViewedTile,
+        pictures: list[ReceivedPicture],
+        moment_s: float,
     ) -> RenderedView:
         """Return the view at ``moment_s`` (monotonic), or at the time of composing it if the
         request is for now."""
@@ -380,22 +386,26 @@ class TwinViews:
             cameras=cameras,
         )
 
-    def _detected(self, seen: TwinView, place: Place) -> Glance:
+    def _detected(self, seen: ReceivedPicture, place: ViewedTile) -> PictureObjects:
         field = self._looking.open_field(place.field_id)
         looked = self._looked_at(seen, field, self._looking)
         labels = () if self._classify is None else _labels(self._classify, looked)
-        return Glance(looked.detections, looked.live.lacks, _origin_m(place, field), labels)
+        return PictureObjects(
+            looked.detections, looked.live.rules_out, _origin_m(place, field), labels
+        )
 
-    def _warmed_up(self, place: Place) -> None:
+    def _warmed_up(self, place: ViewedTile) -> None:
         field = self._looking.open_field(place.field_id)
         x_m, y_m, z_m = (sum(ends) / 2 for ends in zip(*astuple(field.bounds), strict=True))
         self._looking.ground(field).warm_up((x_m, y_m, z_m))
 
-    def _ground_ahead(self, camera: Camera, place: Place) -> None:
+    def _ground_ahead(self, camera: Camera, place: ViewedTile) -> None:
         field = self._looking.open_field(place.field_id)
         self._looking.ground(field).ahead_of(camera)
 
-    def _looked_at(self, seen: TwinView, field: RadianceField, thread: _FieldThread) -> _LookedAt:
+    def _looked_at(
+        self, seen: ReceivedPicture, field: RadianceField, thread: _FieldThread
+    ) -> _AnalysedPicture:
         """Return what a picture changes in ``field``, which is one of ``thread``."""
         kept = self._kept.of(seen, field.field_id)
         if kept is None:
@@ -403,14 +413,16 @@ class TwinViews:
             self._kept.keep(kept, field.field_id)
         return kept
 
-    def _look_at(self, seen: TwinView, field: RadianceField, ground: FieldGround) -> _LookedAt:
+    def _look_at(
+        self, seen: ReceivedPicture, field: RadianceField, ground: FieldGround
+    ) -> _AnalysedPicture:
         assert seen.frame.pose is not None
         rgb, intrinsics = shrunk(seen.picture, seen.intrinsics)
         camera = Camera(intrinsics, seen.frame.pose)
         live = live_picture(camera, rgb, self._field_view(seen, camera, field))
-        return _LookedAt(seen, *cut_out(live, ground))
+        return _AnalysedPicture(seen, *cut_out(live, ground))
 
-    def _field_view(self, seen: TwinView, camera: Camera, field: RadianceField) -> View:
+    def _field_view(self, seen: ReceivedPicture, camera: Camera, field: RadianceField) -> View:
         """Return what ``field`` shows at the ``camera`` of a picture: the decoder's render if that
         is of this field and size."""
         render = self._twin.renders.of(seen)
@@ -424,7 +436,7 @@ def _seconds_of(work: Callable[[], object]) -> float:
     return time.monotonic() - started
 
 
-def _labels(classify: Classify, looked: _LookedAt) -> tuple[str, ...]:
+def _labels(classify: Classify, looked: _AnalysedPicture) -> tuple[str, ...]:
     """Return what ``classify`` calls each thing of a picture, by the box of its outline."""
     rgb, _ = shrunk(looked.seen.picture, looked.seen.intrinsics)
     labels = []
@@ -450,7 +462,7 @@ def _ago_s(request: ViewRequest, now_ns: int, reach_s: float) -> float:
     return ago_s
 
 
-def _origin_m(place: Place, field: RadianceField) -> tuple[float, float, float]:
+def _origin_m(place: ViewedTile, field: RadianceField) -> tuple[float, float, float]:
     """Return where the field's origin is, relative to what ``place`` says poses are."""
     if place.world is None:
         return (0.0, 0.0, 0.0)
@@ -462,7 +474,7 @@ def _origin_m(place: Place, field: RadianceField) -> tuple[float, float, float]:
     )
 
 
-def _in_tile(camera: Camera, place: Place, field: RadianceField) -> Camera:
+def _in_tile(camera: Camera, place: ViewedTile, field: RadianceField) -> Camera:
     """Return a camera that is relative to ``place`` relative to the field's origin."""
     shift = TileOrigin(*_origin_m(place, field))
     return replace(camera, world_from_cam=shift.localise(camera.world_from_cam))

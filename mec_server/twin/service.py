@@ -21,12 +21,12 @@ import grpc
 from mec_server.config import SessionLimits
 from mec_server.peers import Slots, abort, peer_account
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
-from mec_server.twin.rendering import Place, TwinViews
-from mec_server.twin.state import Covers, Mailbox, Twin, TwinView
+from mec_server.twin.rendering import ViewedTile, ViewService
+from mec_server.twin.state import Covers, Mailbox, ReceivedPicture, Twin
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
 from rfcore.image import I420, jpeg_bytes, png_bytes
 from rfcore.native.yuv import rgb_from_i420
-from rfcore.perception.objects import StreetObject, ToldObjects
+from rfcore.perception.objects import ObjectReports, StreetObject
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -46,19 +46,26 @@ from rfcore.wire.twin_render import (
 from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 
-__all__ = ["RenderCalls", "Sight", "TwinPictures", "TwinService", "encoded", "picture_message"]
+__all__ = [
+    "ConsumerAccess",
+    "PictureEncoder",
+    "RenderCalls",
+    "TwinService",
+    "encoded",
+    "picture_message",
+]
 
 
-class TwinPictures:
+class PictureEncoder:
     """Encodes views; an encoded picture is kept as long as its view."""
 
     def __init__(self) -> None:
         self._executor = ThreadPoolExecutor(1, "twin")
-        self._done: WeakKeyDictionary[TwinView, dict[PictureEncoding, asyncio.Future[bytes]]] = (
-            WeakKeyDictionary()
-        )
+        self._done: WeakKeyDictionary[
+            ReceivedPicture, dict[PictureEncoding, asyncio.Future[bytes]]
+        ] = WeakKeyDictionary()
 
-    async def bytes_of(self, view: TwinView, encoding: PictureEncoding) -> bytes:
+    async def bytes_of(self, view: ReceivedPicture, encoding: PictureEncoding) -> bytes:
         """Return the picture of ``view``."""
         done = self._done.setdefault(view, {})
         if encoding not in done:
@@ -89,7 +96,7 @@ AnyContext = grpc.aio.ServicerContext[Any, Any]
 
 
 @dataclass(frozen=True)
-class Sight:
+class ConsumerAccess:
     """What one consumer may see: ``covers`` says it of a picture, ``may_draw`` of a field's id, and
     ``check_vehicles`` raises ``AccessDenied`` for vehicles asked for by name that it can never
     see."""
@@ -115,8 +122,8 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         slots: Slots,
         limits: SessionLimits,
         failed: Callable[[Exception], None],
-        sight: Callable[[Context], Sight],
-        views: TwinViews,
+        sight: Callable[[Context], ConsumerAccess],
+        views: ViewService,
     ) -> None:
         self._twin = twin
         self._sight = sight
@@ -124,7 +131,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         self._slots = slots
         self._stalled_s = limits.stalled_s
         self._failed = failed
-        self._pictures = TwinPictures()
+        self._pictures = PictureEncoder()
         self._draining = asyncio.Event()
         self._views = views
         self._renders = RenderCalls(views, metrics, slots, limits, failed, sight, self._draining)
@@ -134,7 +141,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         twin_pb2_grpc.add_TwinServiceServicer_to_server(self, server)
 
     @property
-    def pictures(self) -> TwinPictures:
+    def pictures(self) -> PictureEncoder:
         """What encodes pictures, each once for whoever wants it."""
         return self._pictures
 
@@ -173,7 +180,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         except LimitExceeded as error:
             self._metrics.ended.labels(ConsumerEnd.REFUSED).inc()
             await abort(context, error)
-        consumer = _Consumer(self._twin, self._pictures, self._metrics, context)
+        consumer = _PictureWriter(self._twin, self._pictures, self._metrics, context)
         with held:
             await self._watch(subscription, sight.covers, context, consumer)
 
@@ -191,12 +198,16 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         def covers(vehicle_id: str, field_id: str) -> bool:
             return field_id in place.field_ids and sight.covers(vehicle_id, field_id)
 
-        consumer = _ObjectsConsumer(self._twin, self._views, self._metrics, context, place)
+        consumer = _ObjectsWriter(self._twin, self._views, self._metrics, context, place)
         with held:
             await self._watch(Subscription(), covers, context, consumer)
 
     async def _watch(
-        self, subscription: Subscription, covers: Covers, context: AnyContext, consumer: _Mailed
+        self,
+        subscription: Subscription,
+        covers: Covers,
+        context: AnyContext,
+        consumer: _MailboxWriter,
     ) -> None:
         self._metrics.consumers.inc()
         end = ConsumerEnd.LEFT
@@ -217,7 +228,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
             )
 
 
-class _Mailed(ABC):
+class _MailboxWriter(ABC):
     """Writes what arrives in one mailbox. ``unread``: what a slow consumer has not taken."""
 
     def __init__(self, twin: Twin, context: AnyContext) -> None:
@@ -281,21 +292,21 @@ class _Mailed(ABC):
         self._arrived.clear()
 
     @abstractmethod
-    async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
+    async def _write(self, mailbox: Mailbox, entry: ReceivedPicture | Departure) -> None:
         """Write what the consumer is to have of one entry."""
 
 
-class _Consumer(_Mailed):
+class _PictureWriter(_MailboxWriter):
     """Writes the pictures themselves."""
 
     def __init__(
-        self, twin: Twin, pictures: TwinPictures, metrics: TwinMetrics, context: Context
+        self, twin: Twin, pictures: PictureEncoder, metrics: TwinMetrics, context: Context
     ) -> None:
         super().__init__(twin, context)
         self._pictures = pictures
         self._metrics = metrics
 
-    async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
+    async def _write(self, mailbox: Mailbox, entry: ReceivedPicture | Departure) -> None:
         if isinstance(entry, Departure):
             await self._context.write(twin_message_to_wire(entry))
             return
@@ -310,22 +321,22 @@ class _Consumer(_Mailed):
         self._metrics.sent_age.observe(age_s)
 
 
-class _ObjectsConsumer(_Mailed):
+class _ObjectsWriter(_MailboxWriter):
     """Writes what the pictures show that the field does not have, as of now."""
 
     def __init__(
         self,
         twin: Twin,
-        views: TwinViews,
+        views: ViewService,
         metrics: TwinMetrics,
         context: AnyContext,
-        place: Place,
+        place: ViewedTile,
     ) -> None:
         super().__init__(twin, context)
         self._views = views
         self._metrics = metrics
         self._place = place
-        self._told = ToldObjects()
+        self._told = ObjectReports()
         self._origin_m = (0.0, 0.0, 0.0)
         self._identity, _ = peer_account(context)
 
@@ -339,15 +350,15 @@ class _ObjectsConsumer(_Mailed):
         again_s = self._told.again_s
         return max(0.0, again_s - time.monotonic()) if math.isfinite(again_s) else None
 
-    async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
-        if isinstance(entry, TwinView):
+    async def _write(self, mailbox: Mailbox, entry: ReceivedPicture | Departure) -> None:
+        if isinstance(entry, ReceivedPicture):
             try:
-                glance = await self._views.glance(entry, self._place, self._identity)
+                found = await self._views.objects_in(entry, self._place, self._identity)
             except LimitExceeded:  # out of worker time: it is missed, as by a slow consumer
                 mailbox.skipped[entry.key] += 1
                 return
-            self._origin_m, seen_s = glance.origin_m, entry.captured_s
-            taken = (glance.detections, entry.key, seen_s, glance.lacks, glance.labels)
+            self._origin_m, seen_s = found.origin_m, entry.captured_s
+            taken = (found.detections, entry.key, seen_s, found.rules_out, found.labels)
             self._told.tracker.take(*taken)
         await self._tell()
 
@@ -363,7 +374,7 @@ class _ObjectsConsumer(_Mailed):
 
 
 def picture_message(
-    view: TwinView, age_s: float, encoding: PictureEncoding, data: bytes, skipped: int
+    view: ReceivedPicture, age_s: float, encoding: PictureEncoding, data: bytes, skipped: int
 ) -> TwinPicture:
     """Return what a consumer is sent of ``view``: its picture as ``data``, in ``encoding``."""
     packet = view.frame.packet
@@ -396,12 +407,12 @@ class RenderCalls:
 
     def __init__(
         self,
-        views: TwinViews,
+        views: ViewService,
         metrics: TwinMetrics,
         slots: Slots,
         limits: SessionLimits,
         failed: Callable[[Exception], None],
-        sight: Callable[[AnyContext], Sight],
+        sight: Callable[[AnyContext], ConsumerAccess],
         draining: asyncio.Event,
     ) -> None:
         self._views = views
@@ -426,7 +437,7 @@ class RenderCalls:
             self._metrics.consumers.inc()
             end = ConsumerEnd.LEFT
             identity, _ = peer_account(context)
-            moving = _MovingCamera(requests, lambda: self._views.spend_message(identity))
+            moving = _ViewRequests(requests, lambda: self._views.spend_message(identity))
             drained = asyncio.create_task(self._draining.wait())
             try:
                 end = await self._follow(moving, drained, context)
@@ -468,7 +479,7 @@ class RenderCalls:
             raise
 
     async def _follow(
-        self, moving: _MovingCamera, drained: asyncio.Task[bool], context: AnyContext
+        self, moving: _ViewRequests, drained: asyncio.Task[bool], context: AnyContext
     ) -> ConsumerEnd:
         while (request := await moving.next(drained, self._idle_s)) is not None:
             skipped = moving.skipped
@@ -492,7 +503,7 @@ class RenderCalls:
         return ConsumerEnd.DRAINED if drained.done() else ConsumerEnd.LEFT
 
 
-class _MovingCamera:
+class _ViewRequests:
     """Reads the requests of one stream, of which it keeps the newest.
 
     ``spend`` is called for each and may raise ``LimitExceeded``, which ends the reading. ``error``:

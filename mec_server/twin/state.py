@@ -28,9 +28,9 @@ __all__ = [
     "Covers",
     "KeptRenders",
     "Mailbox",
-    "PastViews",
+    "PastPictures",
+    "ReceivedPicture",
     "Twin",
-    "TwinView",
 ]
 
 MAX_DEPARTED = 32
@@ -50,7 +50,7 @@ Covers = Callable[[str, str], bool]
 
 
 @dataclass(frozen=True, eq=False)
-class TwinView:
+class ReceivedPicture:
     """One reconstructed picture, and how old it was at ``reconstructed_s`` (monotonic).
 
     ``opened_time_ns``: when its session's Hello came, Unix time of this server.
@@ -108,18 +108,20 @@ class Mailbox:
         self.skipped: Counter[CameraKey] = Counter()
         self.missed = 0
         self._arrived = arrived
-        self._entries: OrderedDict[tuple[CameraKey, type], TwinView | Departure] = OrderedDict()
+        self._entries: OrderedDict[tuple[CameraKey, type], ReceivedPicture | Departure] = (
+            OrderedDict()
+        )
 
     def __len__(self) -> int:
         return len(self._entries)
 
-    def put(self, key: CameraKey, entry: TwinView | Departure) -> bool:
+    def put(self, key: CameraKey, entry: ReceivedPicture | Departure) -> bool:
         """Keep ``entry``: a picture in place of an older one of its camera, or of its departure; a
         departure behind its last picture. Return whether a picture was missed."""
         if not (self.subscription.includes(key[0]) and self._may_see(key, entry)):
             return False
-        missed = isinstance(entry, TwinView) and (key, TwinView) in self._entries
-        if isinstance(entry, TwinView):
+        missed = isinstance(entry, ReceivedPicture) and (key, ReceivedPicture) in self._entries
+        if isinstance(entry, ReceivedPicture):
             self._entries.pop((key, Departure), None)
         if missed:
             self.skipped[key] += 1
@@ -128,7 +130,7 @@ class Mailbox:
         self._arrived()
         return missed
 
-    def _may_see(self, key: CameraKey, entry: TwinView | Departure) -> bool:
+    def _may_see(self, key: CameraKey, entry: ReceivedPicture | Departure) -> bool:
         """Whether the consumer may know of ``entry``: a departure, if it has seen the camera."""
         if isinstance(entry, Departure):
             return key in self._known
@@ -137,7 +139,7 @@ class Mailbox:
         self._known.add(key)
         return True
 
-    def take(self) -> TwinView | Departure | None:
+    def take(self) -> ReceivedPicture | Departure | None:
         """Return what waits longest, or None."""
         if not self._entries:
             return None
@@ -148,19 +150,19 @@ class Mailbox:
         return entry
 
 
-class PastViews:
+class PastPictures:
     """Pictures that newer ones replaced: of each camera at most one in ``KEPT_EVERY_S``, for
     ``KEPT_S``, of all together at most ``most_bytes``, of which the oldest go first."""
 
     def __init__(self, most_bytes: int = MOST_PAST_BYTES) -> None:
         self._most_bytes = most_bytes
         self._bytes = 0
-        self._order: deque[TwinView] = deque()
-        self._cameras: dict[CameraKey, deque[TwinView]] = {}
+        self._order: deque[ReceivedPicture] = deque()
+        self._cameras: dict[CameraKey, deque[ReceivedPicture]] = {}
         self.whole_from_s = -math.inf
         """Moments before this one lack pictures for want of memory."""
 
-    def keep(self, view: TwinView, now: float) -> None:
+    def keep(self, view: ReceivedPicture, now: float) -> None:
         """Keep a picture that a newer one, of the moment ``now``, replaces."""
         kept = self._cameras.setdefault(view.key, deque())
         if not kept or view.captured_s - kept[-1].captured_s >= KEPT_EVERY_S:
@@ -172,7 +174,7 @@ class PastViews:
         while self._bytes > self._most_bytes:
             self.whole_from_s = max(self.whole_from_s, self._drop())
 
-    def of(self, key: CameraKey) -> Iterable[TwinView]:
+    def of(self, key: CameraKey) -> Iterable[ReceivedPicture]:
         """Return the pictures of a camera, the oldest first."""
         return tuple(self._cameras.get(key, ()))
 
@@ -202,10 +204,10 @@ class KeptRenders:
     def __init__(self, most_bytes: int = RENDERS_BYTES) -> None:
         self._most_bytes = most_bytes
         self._bytes = 0
-        self._kept: OrderedDict[CameraKey, tuple[TwinView, View]] = OrderedDict()
+        self._kept: OrderedDict[CameraKey, tuple[ReceivedPicture, View]] = OrderedDict()
         self._lock = Lock()
 
-    def keep(self, picture: TwinView, render: View) -> None:
+    def keep(self, picture: ReceivedPicture, render: View) -> None:
         """Keep ``render``, of the field and pose of ``picture``, in place of its camera's last."""
         with self._lock:
             self._drop(picture.key)
@@ -215,7 +217,7 @@ class KeptRenders:
             while self._bytes > self._most_bytes:
                 self._drop(next(iter(self._kept)))
 
-    def of(self, picture: TwinView) -> View | None:
+    def of(self, picture: ReceivedPicture) -> View | None:
         """Return the render of ``picture``, None if it is not kept."""
         with self._lock:
             kept = self._kept.get(picture.key)
@@ -240,14 +242,14 @@ class Twin:
     """The newest picture of every camera of every vehicle, and some before it."""
 
     def __init__(self) -> None:
-        self._past = PastViews()
+        self._past = PastPictures()
         self.renders = KeptRenders()
-        self._views: dict[CameraKey, TwinView] = {}
-        self._departed: OrderedDict[CameraKey, TwinView] = OrderedDict()
+        self._views: dict[CameraKey, ReceivedPicture] = {}
+        self._departed: OrderedDict[CameraKey, ReceivedPicture] = OrderedDict()
         self._mailboxes: list[Mailbox] = []
         self.missed = 0
 
-    def show(self, view: TwinView, render: View | None = None) -> None:
+    def show(self, view: ReceivedPicture, render: View | None = None) -> None:
         """Take in a picture, unless another stream of its vehicle has sent a newer one.
 
         ``render``: what its field shows there, None where that is not known.
@@ -280,7 +282,7 @@ class Twin:
                     self._departed.popitem(last=False)
                 self._tell(key, Departure(*key))
 
-    def cameras_of(self, session_id: str) -> list[list[TwinView]]:
+    def cameras_of(self, session_id: str) -> list[list[ReceivedPicture]]:
         """Return the kept pictures of each camera that a stream has now, the oldest first."""
         return [
             [*(past for past in self._past.of(key) if past.session_id == session_id), view]
@@ -292,7 +294,7 @@ class Twin:
         """Return how long ago a moment may be, of those that ``at`` knows all pictures of."""
         return max(0.0, min(PAST_S, now - self._past.whole_from_s))
 
-    def at(self, moment_s: float, max_age_s: float) -> list[TwinView]:
+    def at(self, moment_s: float, max_age_s: float) -> list[ReceivedPicture]:
         """Return the picture of every camera that it had captured last at a moment (monotonic), if
         it was no older than ``max_age_s`` then."""
         views = []
@@ -303,7 +305,7 @@ class Twin:
             views += sorted(before, key=lambda view: view.captured_s)[-1:]
         return views
 
-    def recent(self, now: float, max_age_s: float) -> list[TwinView]:
+    def recent(self, now: float, max_age_s: float) -> list[ReceivedPicture]:
         """Return the newest picture of every camera that is no older than ``max_age_s``, also of
         cameras that left; those of them that are older than ``MAX_AGE_S`` are forgotten."""
         for key, view in tuple(self._departed.items()):
@@ -339,6 +341,6 @@ class Twin:
             ages[view.vehicle_id] = max(ages.get(view.vehicle_id, 0.0), view.age_s(now))
         return ages
 
-    def _tell(self, key: CameraKey, entry: TwinView | Departure) -> None:
+    def _tell(self, key: CameraKey, entry: ReceivedPicture | Departure) -> None:
         for mailbox in self._mailboxes:
             self.missed += mailbox.put(key, entry) and mailbox.counts_misses

@@ -53,7 +53,7 @@ from rfcore.native.live_view import (
 )
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.perception.misplacement import misplacement_rad
-from rfcore.perception.patches import Standing, draw_standing, in_front_of
+from rfcore.perception.patches import StandingPatch, draw_standing, in_front_of
 from rfcore.raster.gaussians import F32
 from rfcore.views import View
 
@@ -137,9 +137,9 @@ class LivePicture:
     changed: Mask
     colour: F32
     brightness: float
-    things: tuple[Standing, ...] = ()
+    things: tuple[StandingPatch, ...] = ()
 
-    def lacks(self, at_m: tuple[float, float, float], width_m: float, height_m: float) -> bool:
+    def rules_out(self, at_m: tuple[float, float, float], width_m: float, height_m: float) -> bool:
         """Return whether it should show a thing whose foot is at ``at_m`` and does not.
 
         It should where the foot is in the picture, within ``LOOKED_FOR_M``, and no surface of the
@@ -238,7 +238,7 @@ def with_things(picture: LivePicture, outlines: Sequence[Outline]) -> LivePictur
     depth = picture.depth.copy()
     for outline in outlines:
         depth[outline.box][outline.mask] = 0
-    things = tuple(Standing(_patch(picture, each), each.foot_m) for each in outlines)
+    things = tuple(StandingPatch(_patch(picture, each), each.foot_m) for each in outlines)
     return replace(picture, depth=depth, things=things)
 
 
@@ -291,7 +291,7 @@ def compose(
 
 def _standing(
     pictures: Sequence[tuple[LivePicture, float]], sources: Sequence[LiveSource]
-) -> Iterator[Standing]:
+) -> Iterator[StandingPatch]:
     """Yield the things of the pictures that vouch for anything, with what each weighs."""
     for number, ((picture, _), source) in enumerate(zip(pictures, sources, strict=True)):
         if source.weight > 0:

@@ -46,7 +46,7 @@ from rfcore.camera import Camera
 from rfcore.perception.composition import LivePicture, Outline, with_things
 from rfcore.perception.ground import FieldGround, GroundPlane, points_of, rays_of
 
-__all__ = ["Detection", "Found", "cut_out", "detect", "find"]
+__all__ = ["Detection", "OutlinedDetection", "cut_out", "detect", "find"]
 
 THING_LEVELS = 22.0
 """On the sample's empty drive nothing is found, nor with 18. With 30, 86 % of the vehicles of
@@ -126,14 +126,14 @@ class Contacts:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class OutlinedDetection:
     """A thing in one picture, and where the picture shows it."""
 
     detection: Detection
     outline: Outline
 
 
-def find(picture: LivePicture, ground: FieldGround) -> list[Found]:
+def find(picture: LivePicture, ground: FieldGround) -> list[OutlinedDetection]:
     """Return what ``picture`` shows that the field does not have, from left to right. ``ground`` is
     that field's."""
     if picture.trust == 0:
@@ -144,7 +144,7 @@ def find(picture: LivePicture, ground: FieldGround) -> list[Found]:
         detection = _standing(contacts[thing], picture)
         if detection is not None:
             outline = _outline(picture, contacts[thing], detection)
-            found.append(Found(detection, outline))
+            found.append(OutlinedDetection(detection, outline))
     return found
 
 

@@ -52,7 +52,7 @@ MOST_VIEWS = 512
 
 F64 = NDArray[np.float64]
 Index = NDArray[np.intp]
-Place = tuple[int, int, int, int]
+LatticePoint = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class FieldGround:
 
     def __init__(self, render: Callable[[Camera], View]) -> None:
         self._render = render
-        self._views: OrderedDict[Place, F64] = OrderedDict()
+        self._views: OrderedDict[LatticePoint, F64] = OrderedDict()
 
     def warm_up(self, at_m: tuple[float, float, float]) -> None:
         """Draw one place, so that the next ones take no memory first and half as long again."""
@@ -100,7 +100,7 @@ class FieldGround:
         points_m = np.concatenate(ahead)
         return None if len(points_m) < LEAST_POINTS else _plane_above(points_m, LOWER)
 
-    def _seen(self, place: Place) -> F64:
+    def _seen(self, place: LatticePoint) -> F64:
         """Return points of the ground near a place [N, 3]."""
         seen = self._views.pop(place, None)
         if seen is None:
@@ -110,7 +110,7 @@ class FieldGround:
         self._views[place] = seen
         return seen
 
-    def _drawn(self, place: Place) -> F64:
+    def _drawn(self, place: LatticePoint) -> F64:
         camera, heading_rad = _camera_at(place)
         view = self._render(camera)
         rows, columns = np.nonzero((view.opacity > OPAQUE) & (view.depth > 0))
@@ -154,7 +154,7 @@ def _plane_above(points_m: F64, share: float) -> GroundPlane:
     return GroundPlane((float(middle_m[0]), float(middle_m[1])), height_m, (slopes[0], slopes[1]))
 
 
-def _place_at(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Place:
+def _place_at(x_m: float, y_m: float, z_m: float, heading_rad: float) -> LatticePoint:
     turns = round(math.tau / TURN_STEP_RAD)
     return (
         round(x_m / SIDE_STEP_M),
@@ -164,7 +164,7 @@ def _place_at(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Place:
     )
 
 
-def _camera_at(place: Place) -> tuple[Camera, float]:
+def _camera_at(place: LatticePoint) -> tuple[Camera, float]:
     """Return the camera of a place of the lattice, and its heading."""
     x_m, y_m = (SIDE_STEP_M * step for step in place[:2])
     heading_rad = TURN_STEP_RAD * place[3]

@@ -34,11 +34,11 @@ from rfcore.perception.triangulation import Sighting, placed
 __all__ = [
     "CameraKey",
     "FollowedObject",
-    "Lacks",
+    "ObjectReports",
     "ObjectTracker",
+    "RulesOut",
     "StreetObject",
-    "ToldObjects",
-    "lacks_nothing",
+    "rules_nothing_out",
 ]
 
 GATE_M = 1.5
@@ -64,7 +64,7 @@ poses at most ``composition.MISPLACED_TRUST``."""
 Vec3 = tuple[float, float, float]
 CameraKey = tuple[str, str]
 """(vehicle id, camera id)"""
-Lacks = Callable[[Vec3, float, float], bool]
+RulesOut = Callable[[Vec3, float, float], bool]
 """Whether a picture should show a thing of a width and height (metres) at a place, and does not."""
 
 
@@ -88,7 +88,7 @@ class StreetObject:
     label: str = ""
 
 
-def lacks_nothing(_at_m: Vec3, _width_m: float, _height_m: float) -> bool:
+def rules_nothing_out(_at_m: Vec3, _width_m: float, _height_m: float) -> bool:
     """Say of nothing that it is not there."""
     return False
 
@@ -115,7 +115,7 @@ class _Look:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _TimedDetection:
     """An object in one picture."""
 
     instant: _Instant
@@ -140,7 +140,7 @@ class FollowedObject:
     cameras: dict[CameraKey, float] = field(default_factory=dict)
     marked_px: int = 0
     labels: Counter[str] = field(default_factory=Counter)
-    _sightings: list[_Seen] = field(default_factory=list, init=False)
+    _sightings: list[_TimedDetection] = field(default_factory=list, init=False)
     _looks: deque[_Look] = field(default_factory=lambda: deque(maxlen=LOOKS), init=False)
 
     @property
@@ -183,7 +183,7 @@ class FollowedObject:
         )
         return x, y, z
 
-    def told(self, now: float) -> StreetObject:
+    def report(self, now: float) -> StreetObject:
         """Return what is known of it, where it is now."""
         return StreetObject(
             object_id=self.object_id,
@@ -207,7 +207,7 @@ class FollowedObject:
         self.marked_px += marked_px - look.marked_px
         look.marked_px = marked_px
         self.last_s = max(self.last_s, time_s)
-        self._remember(_Seen(look.instant, time_s, detection))
+        self._remember(_TimedDetection(look.instant, time_s, detection))
         shared = Counter(each.instant for each in self._sightings)
         votes = [1 / shared[each.instant] for each in self._sightings]
         sightings = zip(self._sightings, votes, strict=True)
@@ -233,7 +233,7 @@ class FollowedObject:
         self._looks.append(begun)
         return begun
 
-    def _remember(self, seen: _Seen) -> None:
+    def _remember(self, seen: _TimedDetection) -> None:
         """Add a sighting, and forget those that are too old or too many."""
         self._sightings.append(seen)
         late = [each for each in self._sightings if self.last_s - each.time_s <= REMEMBERED_S]
@@ -248,7 +248,7 @@ class FollowedObject:
         return sum(w * z for w, z in zip(weights, heights_m, strict=True)) / sum(weights)
 
 
-def _sighting(seen: _Seen, vote: float) -> Sighting:
+def _sighting(seen: _TimedDetection, vote: float) -> Sighting:
     """Return on the ground what a picture says of where an object is, and how much that counts."""
     detection = seen.detection
     x_m, y_m = (detection.at_m[axis] - detection.eye_m[axis] for axis in (0, 1))
@@ -276,11 +276,11 @@ class ObjectTracker:
         detections: Sequence[Detection],
         camera: CameraKey,
         time_s: float,
-        lacks: Lacks = lacks_nothing,
+        rules_out: RulesOut = rules_nothing_out,
         labels: Sequence[str] = (),
     ) -> None:
         """Take in what one picture of ``camera``, captured at ``time_s``, shows, of which things it
-        says that they are not there (``lacks``), and what a detector calls each that it shows."""
+        says that they are not there (``rules_out``), and what a detector calls each that it shows."""
         self._objects = [each for each in self._objects if time_s - each.last_s <= FORGOTTEN_S]
         pairs = sorted(
             (distance_m, each.object_id, index)
@@ -298,7 +298,7 @@ class ObjectTracker:
                 each.labels.update(filter(None, labels[index : index + 1]))
                 free.discard(index)
         for each in by_id.values():
-            if lacks(each.at(time_s), each.width_m, each.height_m):
+            if rules_out(each.at(time_s), each.width_m, each.height_m):
                 each.miss(camera, time_s)
         for index in sorted(free):
             begun = self._begin(detections[index], camera, time_s)
@@ -326,7 +326,7 @@ class ObjectTracker:
         return begun
 
 
-class ToldObjects:
+class ObjectReports:
     """What one consumer is told of a tracker: whenever ``now`` is called, and again at ``again_s``
     while there is anything, so that what nobody sees any more goes where no pictures come."""
 
@@ -336,6 +336,6 @@ class ToldObjects:
 
     def now(self, now: float) -> tuple[StreetObject, ...]:
         """Return the confirmed objects, as of ``now``."""
-        objects = tuple(each.told(now) for each in self.tracker.confirmed(now))
+        objects = tuple(each.report(now) for each in self.tracker.confirmed(now))
         self.again_s = now + REPEAT_S if objects else math.inf
         return objects

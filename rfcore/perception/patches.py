@@ -35,7 +35,7 @@ from rfcore.native.live_view import (
 from rfcore.raster.gaussians import F32
 from rfcore.views import View
 
-__all__ = ["Standing", "draw_standing", "in_front_of"]
+__all__ = ["StandingPatch", "draw_standing", "in_front_of"]
 
 SAME_M = 1.5
 
@@ -43,7 +43,7 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class StandingPatch:
     """A patch of a thing whose foot is at ``foot_m`` on the tile's ground, from picture ``source``,
     of which so much counts (``weight``) and is left to be seen (``fade``, 0 to 1)."""
 
@@ -55,11 +55,11 @@ class Standing:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _PatchInView:
     """A thing in rows and columns ``box`` of a view; ``from_view`` maps points of the view's axes
     into those of its camera."""
 
-    thing: Standing
+    thing: StandingPatch
     from_view: Pose
     box: tuple[slice, slice]
     distance_m: float
@@ -71,11 +71,11 @@ def in_front_of(view: View) -> F32:
     return np.where(view.opacity > COVERED, reach, np.float32(np.inf))
 
 
-def draw_standing(canvas: Canvas, things: Iterable[Standing]) -> None:
+def draw_standing(canvas: Canvas, things: Iterable[StandingPatch]) -> None:
     """Draw the things that are seen in the view of ``canvas``, the furthest first."""
     world_from_view = canvas.camera.world_from_cam
     motions: dict[int, Pose] = {}
-    seen: list[_Seen] = []
+    seen: list[_PatchInView] = []
     for each in _once(things):
         if each.source not in motions:
             motions[each.source] = each.patch.camera.cam_from_world().compose(world_from_view)
@@ -86,9 +86,9 @@ def draw_standing(canvas: Canvas, things: Iterable[Standing]) -> None:
         draw_patch(canvas, thing.patch, one.from_view, one.box, thing.source, thing.fade)
 
 
-def _once(things: Iterable[Standing]) -> Sequence[Standing]:
+def _once(things: Iterable[StandingPatch]) -> Sequence[StandingPatch]:
     """Return, of several pictures' patches of one thing, that of the picture that weighs most."""
-    kept: list[Standing] = []
+    kept: list[StandingPatch] = []
     for each in sorted(things, key=lambda it: -it.weight):
         others = (k for k in kept if k.source != each.source)
         if all(math.dist(k.foot_m, each.foot_m) > SAME_M for k in others):
@@ -96,7 +96,7 @@ def _once(things: Iterable[Standing]) -> Sequence[Standing]:
     return kept
 
 
-def _place_in(camera: Camera, thing: Standing, from_view: Pose) -> _Seen | None:
+def _place_in(camera: Camera, thing: StandingPatch, from_view: Pose) -> _PatchInView | None:
     """Return where a thing is in the view of ``camera``, None if it is not seen there."""
     k, in_patch = camera.intrinsics, _corners(thing.patch)
     rotation = np.array(from_view.rotation_matrix())
@@ -112,7 +112,7 @@ def _place_in(camera: Camera, thing: Standing, from_view: Pose) -> _Seen | None:
     rows = _within(k.fy_px * corners[:, 1] / z_m + k.cy_px, k.height_px)
     if columns.start == columns.stop or rows.start == rows.stop:
         return None
-    return _Seen(thing, from_view, (rows, columns), distance_m)
+    return _PatchInView(thing, from_view, (rows, columns), distance_m)
 
 
 def _corners(patch: Patch) -> F64:

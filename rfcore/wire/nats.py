@@ -7,7 +7,7 @@ TwinService sends it (``WatchResponse`` of twin.proto) on
 
 where ENCODING is none (poses and ages, always), or jpeg, i420 or png: while somebody asks for it
 on ``rfedge.wanted.ENCODING``. A departure goes out on all of them. The header ``Rfedge-Place`` says
-which session of which server it belongs to: a ``VehiclePlace`` as JSON. The bucket of keys and
+which session of which server it belongs to: a ``VehicleLocation`` as JSON. The bucket of keys and
 values ``rfedge-places`` holds the same for every vehicle, by name. The object store
 ``rfedge-fields`` holds archives by field id. A name's dots are ``=`` in subjects and keys.
 
@@ -40,8 +40,8 @@ __all__ = [
     "WANTED_EVERY_S",
     "WANTED_S",
     "NatsServers",
-    "VehiclePlace",
-    "VehiclePlaces",
+    "VehicleLocation",
+    "VehicleLocations",
     "key_of",
     "picture_subject",
     "pictures_subject",
@@ -147,7 +147,7 @@ class NatsServers:
 
 
 @dataclass(frozen=True)
-class VehiclePlace:
+class VehicleLocation:
     """Where a vehicle is: session ``session_id`` of ``server``, in ``tile`` (may be empty: none is
     published) against ``field_id``. ``opened_time_ns``: when the vehicle said Hello, Unix
     time of the server; ``epoch``: the last that was seen of it."""
@@ -185,23 +185,23 @@ class VehiclePlace:
         return json.dumps(asdict(self), separators=(",", ":")).encode()
 
     @staticmethod
-    def decode(data: bytes) -> VehiclePlace:
+    def decode(data: bytes) -> VehicleLocation:
         """Return what ``encode`` made; raise ``ProtocolError``."""
         try:
             value: Any = json.loads(data)
-            return VehiclePlace(**value)
+            return VehicleLocation(**value)
         except (ValueError, TypeError, InvalidInput) as error:
             raise ProtocolError(f"a server told an impossible place: {error}") from error
 
 
-class VehiclePlaces:
+class VehicleLocations:
     """Where every vehicle is, of what several servers say. ``now``: seconds, monotonic."""
 
     def __init__(self) -> None:
-        self._heard: dict[str, dict[tuple[str, str], tuple[VehiclePlace, float]]] = {}
+        self._heard: dict[str, dict[tuple[str, str], tuple[VehicleLocation, float]]] = {}
         self._ended: dict[tuple[str, str], float] = {}
 
-    def hear(self, place: VehiclePlace, now: float) -> bool:
+    def hear(self, place: VehicleLocation, now: float) -> bool:
         """Take in what a server says; return whether the vehicle is there."""
         if place.session in self._ended:
             return False
@@ -209,7 +209,7 @@ class VehiclePlaces:
         current = self.place_of(place.vehicle_id)
         return current is not None and current.session == place.session
 
-    def end(self, place: VehiclePlace, now: float) -> bool:
+    def end(self, place: VehicleLocation, now: float) -> bool:
         """Forget a session that its server ended; return whether the vehicle was there."""
         current = self.place_of(place.vehicle_id)
         self._ended[place.session] = now
@@ -226,7 +226,7 @@ class VehiclePlaces:
             if now - ended_s > EXPIRES_S:
                 del self._ended[session]
 
-    def place_of(self, vehicle_id: str) -> VehiclePlace | None:
+    def place_of(self, vehicle_id: str) -> VehicleLocation | None:
         """Return where a vehicle is, ``None`` if no server says."""
         heard = (place for place, _ in self._heard.get(vehicle_id, {}).values())
         return max(heard, key=lambda place: place.rank, default=None)

@@ -29,8 +29,8 @@ from rfcore.wire.nats import (
     PLACE_HEADER,
     WANTED_EVERY_S,
     NatsServers,
-    VehiclePlace,
-    VehiclePlaces,
+    VehicleLocation,
+    VehicleLocations,
     pictures_subject,
     vehicle_of_subject,
     wanted_subject,
@@ -72,10 +72,10 @@ class SharedTwin:
     """The cameras that all servers show, those of a vehicle from where it is. ``now``: seconds."""
 
     def __init__(self) -> None:
-        self.places = VehiclePlaces()
+        self.places = VehicleLocations()
         self._shown: dict[CameraKey, _Shown] = {}
 
-    def hear(self, place: VehiclePlace, message: TwinMessage, now: float) -> bool:
+    def hear(self, place: VehicleLocation, message: TwinMessage, now: float) -> bool:
         """Take in what a server published; return whether it is to be shown."""
         key = message.key
         if isinstance(message, TwinPicture):
@@ -106,7 +106,7 @@ class SharedTwin:
         return place.session != shown.session and now - shown.at_s > EXPIRES_S
 
 
-Take = Callable[[TwinMessage, VehiclePlace | None], None]
+Take = Callable[[TwinMessage, VehicleLocation | None], None]
 """What is done with a picture and where its vehicle is; a departure comes without."""
 
 
@@ -151,7 +151,7 @@ class NatsReader:
         async for entry in watcher:
             if entry is not None:
                 with suppress(ProtocolError):
-                    place = VehiclePlace.decode(entry.value or b"")
+                    place = VehicleLocation.decode(entry.value or b"")
                     self._twin.places.hear(place, self._clock())
 
     async def _expire(self) -> None:
@@ -174,14 +174,16 @@ class NatsReader:
             self._take(message, place if isinstance(message, TwinPicture) else None)
 
 
-def published_message(subject: str, header: str, body: bytes) -> tuple[VehiclePlace, TwinMessage]:
+def published_message(
+    subject: str, header: str, body: bytes
+) -> tuple[VehicleLocation, TwinMessage]:
     """Return what a server published; raise ``ProtocolError`` unless all three are of one vehicle,
     which is what NATS gives permissions by."""
     try:
         message = twin_message_from_wire(twin_pb2.WatchResponse.FromString(body))
     except DecodeError as error:
         raise ProtocolError(f"{subject}: {error}") from error
-    place = VehiclePlace.decode(header.encode())
+    place = VehicleLocation.decode(header.encode())
     named = {vehicle_of_subject(subject), place.vehicle_id, message.vehicle_id}
     if len(named) > 1:
         raise ProtocolError(f"{subject} carries what is of {', '.join(sorted(named))}")
@@ -222,7 +224,7 @@ class NatsSource:
     def _say(self, connected: bool, detail: str) -> None:
         self._scene.connection("connected" if connected else "waiting", detail, self._clock())
 
-    def _take(self, message: TwinMessage, place: VehiclePlace | None) -> None:
+    def _take(self, message: TwinMessage, place: VehicleLocation | None) -> None:
         if isinstance(message, Departure):
             self._scene.leave(message.key, self._clock())
             return
@@ -297,7 +299,7 @@ class NatsPictures:
             self._stopped = True
             self._wake()
 
-    def _take(self, message: TwinMessage, _: VehiclePlace | None) -> None:
+    def _take(self, message: TwinMessage, _: VehicleLocation | None) -> None:
         if isinstance(message, TwinPicture):
             self._waiting.discard((message.key, Departure))
         self._waiting.put((message.key, type(message)), message)

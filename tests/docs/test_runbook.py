@@ -323,7 +323,7 @@ def damage(archive: Path) -> None:
     archive.write_bytes(data)
 
 
-Harm = Callable[[Path, Path], None]
+BitsIncrease = Callable[[Path, Path], None]
 
 
 @pytest.mark.parametrize(
@@ -339,7 +339,7 @@ Harm = Callable[[Path, Path], None]
 )
 @pytest.mark.usefixtures("desk")
 async def test_a_bad_copy_is_told(
-    street: Any, stack: AsyncExitStack, harm: Harm, says: str
+    street: Any, stack: AsyncExitStack, harm: BitsIncrease, says: str
 ) -> None:
     await Operator(stack, None).types(EVERYWHERE)
     ids = street.field_id, street.other_id

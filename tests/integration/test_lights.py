@@ -13,7 +13,7 @@ import pytest
 from cav_agent.field_fetch import fetch_field
 from mec_server.config import LearnSettings
 from mec_server.learner import UnrecordedTrials
-from mec_server.twin.state import TwinView
+from mec_server.twin.state import ReceivedPicture
 from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore, SplatField, load_field, save_field
 from rfcore.field.delta import delta_of
@@ -177,7 +177,7 @@ def lit(driving: Any) -> str | None:
 async def test_learnt_fields_are_tried_on_vehicles_that_are_not_recorded(
     coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: list[TwinView] = []
+    seen: list[ReceivedPicture] = []
     left: list[str] = []
     monkeypatch.setattr(UnrecordedTrials, "saw", lambda _, view: seen.append(view))
     monkeypatch.setattr(UnrecordedTrials, "left", lambda _, name: left.append(name))

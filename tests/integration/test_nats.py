@@ -23,7 +23,7 @@ from mec_server.config import NatsSettings
 from mec_server.nats import NatsLink, fetch_object
 from mec_server.twin.nats import PlaceRecords
 from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
-from rfcore.wire.nats import FIELDS_BUCKET, PLACES_BUCKET, NatsServers, VehiclePlace
+from rfcore.wire.nats import FIELDS_BUCKET, PLACES_BUCKET, NatsServers, VehicleLocation
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tile_manifest import MANIFEST
 from rfcore.wire.tiles import Area
@@ -54,7 +54,7 @@ class Seen:
         self.messages: list[TwinMessage] = []
         self.connected: list[bool] = []
 
-    def take(self, message: TwinMessage, _: VehiclePlace | None) -> None:
+    def take(self, message: TwinMessage, _: VehicleLocation | None) -> None:
         self.messages.append(message)
 
     def say(self, connected: bool, _: str) -> None:
@@ -141,7 +141,7 @@ def _sequence(message: TwinMessage) -> int:
 
 async def _server_in(bucket: Any) -> str:
     try:
-        return VehiclePlace.decode((await bucket.get("cav-raw")).value).server
+        return VehicleLocation.decode((await bucket.get("cav-raw")).value).server
     except nats.js.errors.KeyNotFoundError:
         return ""
 
@@ -161,11 +161,11 @@ async def test_of_two_servers_that_write_a_vehicles_place_the_newer_session_stay
     async with connected(broker) as client:
         bucket = await client.jetstream().create_key_value(bucket="test")
         east, west = PlaceRecords(bucket), PlaceRecords(bucket)
-        old = VehiclePlace("cav.1", "east", "s1", 1, 0, "", "ab" * 32)
+        old = VehicleLocation("cav.1", "east", "s1", 1, 0, "", "ab" * 32)
         new = replace(old, server="west", session_id="s2", opened_time_ns=2)
 
-        async def written() -> VehiclePlace:
-            return VehiclePlace.decode((await bucket.get("cav=1")).value)
+        async def written() -> VehicleLocation:
+            return VehicleLocation.decode((await bucket.get("cav=1")).value)
 
         for _ in range(2):
             await east.write({"cav.1": old})

@@ -20,7 +20,7 @@ from mec_server.reconstruction import (
     open_cameras,
 )
 from mec_server.session import DecodeJob, OpenJob
-from mec_server.twin.state import Twin, TwinView
+from mec_server.twin.state import ReceivedPicture, Twin
 from rfcore.camera import Pose, camera_on_rig
 from rfcore.dataset.rig import read_rig, read_rig_drive
 from rfcore.errors import PacketRejected, RejectReason
@@ -38,12 +38,12 @@ def rig(street: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[TwinView]:
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[ReceivedPicture]:
     """What the twin of any server shows."""
-    views: list[TwinView] = []
+    views: list[ReceivedPicture] = []
     show = Twin.show
 
-    def keep(twin: Twin, view: TwinView, *render: View) -> None:
+    def keep(twin: Twin, view: ReceivedPicture, *render: View) -> None:
         views.append(view)
         show(twin, view, *render)
 
@@ -76,7 +76,7 @@ def failing_camera(camera_id: str) -> OpenCameras:
 
 
 async def test_four_cameras_are_one_session_with_one_pose_an_instant(
-    serve: Any, vehicle: Any, seen: list[TwinView], rig: Path
+    serve: Any, vehicle: Any, seen: list[ReceivedPicture], rig: Path
 ) -> None:
     async with serve() as server, vehicle(server.address, drive=None, rig=rig) as driving:
         counts = await driving.end()
@@ -188,7 +188,7 @@ def write_video(path: Path, pictures: list[Rgb]) -> None:
 
 
 async def test_the_live_cameras_of_a_rig_are_sent_together_without_the_one_that_is_lost(
-    serve: Any, vehicle: Any, seen: list[TwinView], rig: Path, tmp_path: Path
+    serve: Any, vehicle: Any, seen: list[ReceivedPicture], rig: Path, tmp_path: Path
 ) -> None:
     file = await asyncio.to_thread(write_live_rig, tmp_path / "live", rig)
     changes = {"pace": PaceKind.REALTIME, "rate": 5.0, "loop": True}

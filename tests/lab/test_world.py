@@ -10,9 +10,9 @@ import pytest
 
 from lab.world import EvalWorld
 from lab.world.objects import (
-    Found,
-    SeenDrive,
-    SeenPicture,
+    AnnotatedDrive,
+    AnnotatedPicture,
+    FoundVehicles,
     dusk_scenes,
     empty_minute,
     followed,
@@ -92,15 +92,15 @@ def picture_of(field: SplatField, camera: Camera) -> np.ndarray:
     return np.rint(field.render(camera).colour.clip(0, 1) * 255).astype(np.uint8)
 
 
-def approach(street: SplatField, vehicles: tuple[VisibleVehicle, ...]) -> SeenDrive:
+def approach(street: SplatField, vehicles: tuple[VisibleVehicle, ...]) -> AnnotatedDrive:
     """Six pictures on the way towards y = 10 m, one every 0.1 s."""
     pictures = []
     for step in range(6):
         camera = camera_at(0.05 * step)
         view = FIELD.render(camera)
         rgb = picture_of(street, camera)
-        pictures.append(SeenPicture(camera, 0.1 * step, rgb, view, vehicles))
-    return SeenDrive(tuple(pictures), GROUND)
+        pictures.append(AnnotatedPicture(camera, 0.1 * step, rgb, view, vehicles))
+    return AnnotatedDrive(tuple(pictures), GROUND)
 
 
 CAR = Footprint(np.float32([[-0.1, 10], [1.7, 10], [1.7, 11], [-0.1, 11]]))
@@ -124,7 +124,7 @@ def test_what_is_far_from_every_vehicle_is_false() -> None:
     assert len(found.false) == 1
     assert found.errors_m == pytest.approx([9.0] * len(found.errors_m), abs=0.5), "none is left out"
     assert len(found.errors_m) >= 5
-    assert followed(approach(FIELD, ()), 0.0) == Found()
+    assert followed(approach(FIELD, ()), 0.0) == FoundVehicles()
 
 
 def test_one_object_is_one_vehicle() -> None:
@@ -132,7 +132,7 @@ def test_one_object_is_one_vehicle() -> None:
     near = VisibleVehicle(0, SQUARE, pixels=5000, nearest_m=9.0)
     beside = VisibleVehicle(1, Footprint(SQUARE.outline_m + np.float32([2.5, 0])), 5000, 9.0)
     street = FIELD
-    picture = SeenPicture(
+    picture = AnnotatedPicture(
         camera_at(), 0.0, np.zeros((1, 1, 3), np.uint8), street.render(camera_at()), (near, beside)
     )
 
@@ -140,7 +140,7 @@ def test_one_object_is_one_vehicle() -> None:
         zero = (0.0, 0.0, 0.0)
         return FollowedObject(number, (x_m, 0.5, 0.0), zero, 1.8, 1.5, 0.0, 0.0)
 
-    one, two = Found(), Found()
+    one, two = FoundVehicles(), FoundVehicles()
     one.take(picture, [thing(1, 2.2)])
     assert (one.to_find, one.found) == (2, 1)
     two.take(picture, [thing(1, 2.2), thing(2, 2.4)])
@@ -158,7 +158,7 @@ def test_pictures_are_looked_at_as_they_are_decoded() -> None:
 def test_the_empty_minute_is_a_minute_with_noise_of_its_own_each_time() -> None:
     drive = approach(FIELD, ())
     assert drive.seconds == pytest.approx(0.6)
-    longer = SeenDrive(
+    longer = AnnotatedDrive(
         tuple(replace(each, time_s=40 * each.time_s) for each in drive.pictures[:2]), GROUND
     )
     row = empty_minute(longer)

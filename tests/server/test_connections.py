@@ -31,8 +31,8 @@ from mec_server.connections import (
     SILENT_S,
     UNCALLED_BYTES,
     UNEXPLAINED_BYTES,
+    ClosedConnections,
     Connections,
-    Cut,
     bar,
     keep_silent_out,
     peer_name,
@@ -105,7 +105,7 @@ def test_the_newest_beyond_the_cap_are_cut_and_another_address_keeps_its_own(
         modest.send(b"x")
         stack.enter_context(listener.accept()[0])
         (cut,) = connections.sweep(0.25)
-        assert cut == Cut("127.0.0.1", Limit.ADDRESS_CONNECTIONS, 3, barred=False)
+        assert cut == ClosedConnections("127.0.0.1", Limit.ADDRESS_CONNECTIONS, 3, barred=False)
         assert [is_closed(near) for near in greedy] == [False, False, True, True, True]
         assert not is_closed(modest)
 
@@ -173,7 +173,7 @@ def test_bytes_that_become_no_message_end_a_connection_and_messages_do_not(
     connections.explain(pairs.peers[0], 2 * UNEXPLAINED_BYTES)
     connections.exempt(pairs.peers[1])
     cuts = connections.sweep(0.25)
-    assert cuts == [Cut("127.0.0.1", Limit.CONNECTION_BYTES, 1, barred=True)]
+    assert cuts == [ClosedConnections("127.0.0.1", Limit.CONNECTION_BYTES, 1, barred=True)]
     assert [is_closed(near) for near in pairs.nears] == [False, False, True]
 
 
@@ -248,7 +248,7 @@ def test_an_identity_holds_so_many_connections_and_a_proxy_as_many_as_it_needs(
         connections.claim(peer, "proxy")
         connections.exempt(peer)
     (cut,) = connections.sweep(0.0)
-    assert cut == Cut("127.0.0.1", Limit.IDENTITY_CONNECTIONS, 2, barred=True)
+    assert cut == ClosedConnections("127.0.0.1", Limit.IDENTITY_CONNECTIONS, 2, barred=True)
     assert [is_closed(near) for near in greedy.nears] == [False, False, True, True]
     assert not any(is_closed(near) for near in (*modest.nears, *proxy.nears))
 
@@ -280,7 +280,7 @@ def test_an_address_that_offended_is_not_answered_for_a_while_and_others_are(
     connections.sweep(0.0)
     connections.offend(guilty.peers[0], Limit.HEADER_BYTES, 0.0)
     cuts = connections.sweep(0.25)
-    assert cuts == [Cut("127.0.0.2", Limit.HEADER_BYTES, 1, barred=True)]
+    assert cuts == [ClosedConnections("127.0.0.2", Limit.HEADER_BYTES, 1, barred=True)]
     assert not connections.sweep(0.5), "told once"
     assert not can_connect(port, "127.0.0.2")
     assert can_connect(port, "127.0.0.1")

@@ -93,7 +93,7 @@ def test_what_a_wrong_pose_shows_is_doubtful(
         camera = off(picture.camera, right_m, yaw_degrees)
         live = live_picture(camera, picture.read(), field.render(camera))
         assert live.trust <= MISPLACED_TRUST
-        tracker.take(detect(live, ground), ("wrong", "front"), 0.1 * number, live.lacks)
+        tracker.take(detect(live, ground), ("wrong", "front"), 0.1 * number, live.rules_out)
     found = tracker.confirmed(0.2)
     assert all(each.is_doubtful for each in found)
 

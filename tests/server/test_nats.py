@@ -16,8 +16,8 @@ from mec_server.metrics import ServerMetrics
 from mec_server.nats import NatsLink
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.nats import TwinPublisher
-from mec_server.twin.service import TwinPictures
-from mec_server.twin.state import Twin, TwinView
+from mec_server.twin.service import PictureEncoder
+from mec_server.twin.state import ReceivedPicture, Twin
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
@@ -39,14 +39,16 @@ def test_without_nats_its_package_is_not_imported() -> None:
 async def test_while_nats_is_away_one_picture_a_camera_waits_and_the_others_are_counted(
     make_frame: Callable[..., Frame],
 ) -> None:
-    registry, twin, pictures = CollectorRegistry(), Twin(), TwinPictures()
+    registry, twin, pictures = CollectorRegistry(), Twin(), PictureEncoder()
     metrics = TwinMetrics(ServerMetrics(registry).instruments, dict, int)
     TwinPublisher(NatsLink(NOWHERE, "test"), "east", twin, pictures, tuple, metrics)
     for sequence in range(100):
         for vehicle in ("cav-1", "cav-2"):
             frame = replace(make_frame(sequence), capture_time_ns=sequence)
             k = Intrinsics(2, 2, 1.0, 1.0, 1.0, 1.0)
-            twin.show(TwinView(vehicle, "s", frame, k, "ab" * 32, PICTURE, b"d" * 16, 10.0, 0.2))
+            twin.show(
+                ReceivedPicture(vehicle, "s", frame, k, "ab" * 32, PICTURE, b"d" * 16, 10.0, 0.2)
+            )
     twin.leave("s")
     pictures.close()
     (mailbox,) = twin._mailboxes

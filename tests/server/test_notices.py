@@ -16,10 +16,10 @@ from mec_server.twin.notices import (
     OwnCamera,
     StreamNotices,
     StreetNotices,
-    Whereabouts,
+    VehiclePosition,
     field_changes,
 )
-from mec_server.twin.rendering import Glance
+from mec_server.twin.rendering import PictureObjects
 from rfcore.camera import Pose
 from rfcore.perception.objects import FollowedObject
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
@@ -30,7 +30,7 @@ NOW = 100.0
 HERE = Pose((0.0, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5))
 """A camera that looks along x, as those of the sample's street."""
 STANDING = OwnCamera(NOW, HERE.translation_m, (0.0, 0.0, 0.0))
-OWN = Whereabouts((STANDING,), (1.0, 0.0, 0.0))
+OWN = VehiclePosition((STANDING,), (1.0, 0.0, 0.0))
 
 
 def thing(
@@ -46,7 +46,7 @@ def told(
     *objects: FollowedObject,
     stream: StreamNotices | None = None,
     now: float = NOW,
-    own: Whereabouts = OWN,
+    own: VehiclePosition = OWN,
 ) -> list:
     stream = stream or StreamNotices("me")
     return stream.about_objects(FIELD, own, objects, now)
@@ -96,7 +96,7 @@ async def test_an_object_is_told_of_with_a_picture_that_shows_it(
     monkeypatch.setattr(notices, "ObjectTracker", lambda: tracker)
     monkeypatch.setattr(notices.time, "monotonic", lambda: NOW)
     twin = Mock(cameras_of=lambda _: [[view(None), view(HERE)], [view(None, camera_id="rear")]])
-    views = Mock(glance=AsyncMock(return_value=Glance([])))
+    views = Mock(objects_in=AsyncMock(return_value=PictureObjects([])))
     taker = Mock(
         session_id="s", vehicle_id="me", camera_ids=("front",), field_ids=frozenset((FIELD,))
     )
@@ -136,13 +136,13 @@ def test_a_vehicle_is_not_told_of_itself() -> None:
     assert told(thing(1, 1.0, y_m=-2.5)) == []
     assert len(told(thing(1, 4.0))) == 1
     side = replace(STANDING, at_m=(3.5, 0.0, 1.5))
-    assert told(thing(1, 4.0), own=Whereabouts((STANDING, side), OWN.ahead)) == []
+    assert told(thing(1, 4.0), own=VehiclePosition((STANDING, side), OWN.ahead)) == []
 
 
 def test_a_vehicle_that_drives_is_not_told_of_where_it_just_was_or_is_by_now() -> None:
     """At 20 m/s its newest picture is 0.4 s old; others saw it 0.1 s ago, as standing."""
     driving = OwnCamera(NOW - 0.4, (0.0, 0.0, 1.5), (20.0, 0.0, 0.0))
-    own = Whereabouts((driving,), (1.0, 0.0, 0.0))
+    own = VehiclePosition((driving,), (1.0, 0.0, 0.0))
     assert told(thing(1, 8.0), own=own) == [], "it is at 8 m by now"
     assert told(thing(1, 6.5), own=own) == []
     assert told(thing(1, 10.5), own=own) == []
@@ -155,13 +155,13 @@ def test_ahead_is_the_way_driven_whichever_camera_came_last() -> None:
     front = [view(moved(0.2 * n), NOW - 0.6 + 0.1 * n) for n in range(6)]
     rear_poses = [replace(BACK, translation_m=(0.2 * n - 2, 0.0, 1.5)) for n in range(6)]
     rear = [view(p, NOW - 0.59 + 0.1 * n, "rear") for n, p in enumerate(rear_poses)]
-    own = Whereabouts.of([front, rear], ("rear", "front"))
+    own = VehiclePosition.of([front, rear], ("rear", "front"))
     assert own.ahead == pytest.approx((2.0, 0.0, 0.0))
     assert own.cameras[0].at_m == (-1.0, 0.0, 1.5)
     assert own.distance_ahead_m(thing(1, 20.0), NOW) is not None
     assert own.distance_ahead_m(thing(1, -20.0), NOW) is None
     reversing = [view(moved(-0.5 * n), NOW - 0.6 + 0.1 * n) for n in range(6)]
-    assert Whereabouts.of([reversing], ("front",)).distance_ahead_m(thing(1, -20.0), NOW)
+    assert VehiclePosition.of([reversing], ("front",)).distance_ahead_m(thing(1, -20.0), NOW)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_ahead_of_a_rig_that_stands_is_where_its_first_camera_looks(
 ) -> None:
     """The camera of the second name looks back, and its picture came last."""
     one, other = [view(HERE, NOW - 0.2, names[0])], [view(BACK, NOW - 0.1, names[1])]
-    assert Whereabouts.of([one, other], camera_ids).ahead[0] == pytest.approx(ahead)
+    assert VehiclePosition.of([one, other], camera_ids).ahead[0] == pytest.approx(ahead)
 
 
 def test_a_thing_that_its_own_camera_loses_is_told_of() -> None:

@@ -11,7 +11,7 @@ from rfcore.field import SplatField
 from rfcore.perception.composition import LivePicture, live_picture
 from rfcore.perception.contacts import Detection, detect
 from rfcore.perception.ground import FieldGround
-from rfcore.perception.objects import FORGOTTEN_S, REPEAT_S, ObjectTracker, ToldObjects
+from rfcore.perception.objects import FORGOTTEN_S, REPEAT_S, ObjectReports, ObjectTracker
 from rfcore.raster.gaussians import Gaussians
 
 INTRINSICS = Intrinsics(320, 180, 260.0, 260.0, 160.0, 80.0)
@@ -292,15 +292,19 @@ def test_a_picture_lacks_what_it_should_show_and_does_not() -> None:
     empty, with_car = picture_of(FIELD, camera_at()), picture_of(joined(STREET, car(0.8, 10.0)),
                                                                  camera_at())  # fmt: skip
     foot_m, size_m = (0.8, 10.0, -CAMERA_M), (1.8, 1.4)
-    assert empty.lacks(foot_m, *size_m)
-    assert not with_car.lacks(foot_m, *size_m), "something is there"
-    assert with_car.lacks((-3.0, 12.0, -CAMERA_M), *size_m), "and nothing beside it"
-    assert not with_car.lacks((0.8, 14.0, -CAMERA_M), *size_m), "behind it nobody knows"
+    assert empty.rules_out(foot_m, *size_m)
+    assert not with_car.rules_out(foot_m, *size_m), "something is there"
+    assert with_car.rules_out((-3.0, 12.0, -CAMERA_M), *size_m), "and nothing beside it"
+    assert not with_car.rules_out((0.8, 14.0, -CAMERA_M), *size_m), "behind it nobody knows"
     for elsewhere in ((0.8, -10.0), (20.0, 10.0), (0.8, 2.0), (0.8, 30.0)):
-        assert not empty.lacks((*elsewhere, -CAMERA_M), *size_m), "outside of the picture, or far"
-    assert not replace(empty, trust=0.0).lacks(foot_m, *size_m)
+        assert not empty.rules_out((*elsewhere, -CAMERA_M), *size_m), (
+            "outside of the picture, or far"
+        )
+    assert not replace(empty, trust=0.0).rules_out(foot_m, *size_m)
     wall_m = np.full_like(empty.depth, 4.0)
-    assert not replace(empty, depth=wall_m).lacks(foot_m, *size_m), "behind a surface of the field"
+    assert not replace(empty, depth=wall_m).rules_out(foot_m, *size_m), (
+        "behind a surface of the field"
+    )
 
 
 def test_what_stands_has_no_velocity_though_its_range_is_uncertain() -> None:
@@ -361,7 +365,7 @@ def test_a_picture_that_comes_late_moves_nothing_wildly() -> None:
 
 def test_objects_are_told_of_as_of_now_and_again_until_none_is_left() -> None:
     """A mover at 10 m/s whose pictures are 0.2 s old when they are looked at, and then stop."""
-    told = ToldObjects()
+    told = ObjectReports()
     assert told.now(0.0) == ()
     assert told.again_s == math.inf, "where nothing is, nothing is told again"
     for step in range(8):

@@ -10,10 +10,10 @@ import pytest
 
 from mec_server import recorder as module
 from mec_server.recorder import (
+    FieldTiles,
     KeepLimits,
     Recorder,
     SessionRecording,
-    TilesOfFields,
     picture_name,
 )
 from recorded import recorded, recorded_parts
@@ -54,7 +54,7 @@ def open_recorder(tmp_path: Path, clock: Clock) -> Callable[..., Recorder]:
     ) -> Recorder:
         limits = KeepLimits(max_bytes, max_age_s)
         origins, names = {FIELD: ORIGIN, EAST: ORIGIN}, {FIELD: "west", EAST: "east", "": ""}
-        tiles = TilesOfFields(origins.__getitem__, names.__getitem__)
+        tiles = FieldTiles(origins.__getitem__, names.__getitem__)
         return Recorder(tmp_path, limits, tiles, clock, on_failure)
 
     return make

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mec_server.twin.rendering import place_of
+from mec_server.twin.rendering import viewed_tile
 from mec_server.twin.state import (
     KEPT_EVERY_S,
     KEPT_S,
     PAST_S,
     KeptRenders,
     Mailbox,
-    PastViews,
+    PastPictures,
+    ReceivedPicture,
     Twin,
-    TwinView,
 )
 from rfcore.camera import Intrinsics, TileOrigin
 from rfcore.errors import InvalidInput
@@ -31,16 +31,16 @@ from rfcore.wire.twin_render import ObjectsRequest
 
 PICTURE = I420(*(np.zeros(size, np.uint8) for size in ((2, 2), (1, 1), (1, 1))))
 INTRINSICS = Intrinsics(2, 2, 1.0, 1.0, 1.0, 1.0)
-MakeView = Callable[..., TwinView]
+MakeView = Callable[..., ReceivedPicture]
 
 
 @pytest.fixture
 def view(make_frame: Callable[..., Frame]) -> MakeView:
     def make(
         vehicle: str = "cav-1", session: str = "s-1", sequence: int = 0, captured_ns: int = 1
-    ) -> TwinView:
+    ) -> ReceivedPicture:
         frame = replace(make_frame(sequence), capture_time_ns=captured_ns)
-        return TwinView(
+        return ReceivedPicture(
             vehicle, session, frame, INTRINSICS, "ab" * 32, PICTURE, b"d" * 16, 10.0, 0.25
         )
 
@@ -51,7 +51,7 @@ def taken(mailbox: Mailbox) -> list[tuple[str, int | None]]:
     """Empty a mailbox; return (vehicle, sequence), None for a departure."""
     entries = []
     while (entry := mailbox.take()) is not None:
-        is_view = isinstance(entry, TwinView)
+        is_view = isinstance(entry, ReceivedPicture)
         entries.append((entry.vehicle_id, entry.frame.packet.sequence if is_view else None))
     return entries
 
@@ -164,7 +164,7 @@ def test_what_was_shown_is_taken_or_missed_and_never_both(steps: list[tuple[str,
             got += mailbox.take() is not None
         else:
             frame = object.__new__(Frame)
-            entry = TwinView(name, "s", frame, INTRINSICS, "", PICTURE, b"", 0.0, 0.0)
+            entry = ReceivedPicture(name, "s", frame, INTRINSICS, "", PICTURE, b"", 0.0, 0.0)
             mailbox.put((name, "front"), entry)
             shown += 1
         assert len(mailbox) <= 2
@@ -250,7 +250,7 @@ def test_places_are_in_the_tile_of_their_area_or_else_the_nearest_that_reaches_t
     everywhere = Tile("all", "ef" * 32)
 
     def tile_at(east_m: float, north_m: float, *tiles: Tile) -> str:
-        place = place_of(ObjectsRequest(place=TileOrigin(east_m, north_m)), tiles)
+        place = viewed_tile(ObjectsRequest(place=TileOrigin(east_m, north_m)), tiles)
         return next(tile.name for tile in tiles if tile.field_id == place.field_id)
 
     assert tile_at(99.0, 25.0, east, west) == "west"
@@ -267,7 +267,7 @@ def test_places_are_in_the_tile_of_their_area_or_else_the_nearest_that_reaches_t
 def test_the_past_of_all_cameras_has_a_limit_and_says_from_when_on_it_is_whole(
     view: MakeView,
 ) -> None:
-    past = PastViews(most_bytes=10 * view().picture_bytes)
+    past = PastPictures(most_bytes=10 * view().picture_bytes)
     assert view().picture_bytes == 6
     for number in range(30):
         for vehicle in ("cav-1", "cav-2"):

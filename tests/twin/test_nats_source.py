@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, ProtocolError
-from rfcore.wire.nats import EXPIRES_S, VehiclePlace, picture_subject
+from rfcore.wire.nats import EXPIRES_S, VehicleLocation, picture_subject
 from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, twin_message_to_wire
 from rfedge.cli.services import Watch
 from rfedge.cli.twin import Twin
@@ -18,8 +18,8 @@ K = Intrinsics(2, 2, 1.0, 1.0, 1.0, 1.0)
 KEY = ("cav-1", "front")
 
 
-def place(server: str, opened: int) -> VehiclePlace:
-    return VehiclePlace("cav-1", server, f"s{opened}", opened, 0, "street", "ab" * 32)
+def place(server: str, opened: int) -> VehicleLocation:
+    return VehicleLocation("cav-1", server, f"s{opened}", opened, 0, "street", "ab" * 32)
 
 
 def picture(sequence: int, session: str = "s1", camera: str = "front") -> TwinPicture:
@@ -70,7 +70,7 @@ def test_a_vehicle_that_stands_stays_as_long_as_its_server_tells_of_it() -> None
     assert twin.expire(29.0 + EXPIRES_S + 0.1) == [DEPARTURE]
 
 
-Event = tuple[VehiclePlace, TwinMessage]
+Event = tuple[VehicleLocation, TwinMessage]
 
 
 @st.composite

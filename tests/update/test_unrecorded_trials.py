@@ -11,8 +11,8 @@ from structlog.testing import capture_logs
 
 from mec_server.learner import MOST_PAUSE_S, Learner, UnrecordedTrials
 from mec_server.tile_history import Learnt, TileHistory, read_histories, write_histories
-from mec_server.tile_learning import CHECK_EVERY, CHECK_FRAMES, Harm
-from mec_server.twin.state import TwinView
+from mec_server.tile_learning import CHECK_EVERY, CHECK_FRAMES, BitsIncrease
+from mec_server.twin.state import ReceivedPicture
 from rfcore.field import SplatField, save_field
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.update.passes import Pass
@@ -25,9 +25,9 @@ MakePass = Callable[..., Pass]
 WAIT_S = 60
 
 
-def seen(drive: Pass, field_id: str, number: int, at_s: float | None = None) -> TwinView:
+def seen(drive: Pass, field_id: str, number: int, at_s: float | None = None) -> ReceivedPicture:
     picture = drive.pictures[number % len(drive.pictures)]
-    return TwinView(
+    return ReceivedPicture(
         vehicle_id=drive.identity,
         session_id="s",
         frame=Mock(pose=picture.camera.world_from_cam, camera_id="front"),
@@ -45,7 +45,7 @@ class Watched:
 
     def __init__(self, noon: SplatField, dusk: SplatField) -> None:
         fields = {noon.field_id: noon, dusk.field_id: dusk}
-        self.reports: asyncio.Queue[Harm] = asyncio.Queue()
+        self.reports: asyncio.Queue[BitsIncrease] = asyncio.Queue()
         self.failures: list[Exception] = []
         self.learnt = Learnt(dusk.field_id, "h17", noon.field_id, 2, 20.0, NOW_MS)
         self.trials = UnrecordedTrials(
@@ -53,7 +53,7 @@ class Watched:
         )
         self.trials.watch({"west": TileHistory((self.learnt,))})
 
-    async def report(self) -> Harm:
+    async def report(self) -> BitsIncrease:
         async with asyncio.timeout(WAIT_S):
             return await self.reports.get()
 
@@ -132,15 +132,15 @@ def test_a_reported_harm_withdraws_what_it_names_if_it_is_large(
 ) -> None:
     rounds = street.rounds()
     for harm in (
-        Harm("west", published, "c", 2.0),
-        Harm("west", street.noon_id, "c", 50.0),
-        Harm("east", published, "c", 50.0),
+        BitsIncrease("west", published, "c", 2.0),
+        BitsIncrease("west", street.noon_id, "c", 50.0),
+        BitsIncrease("east", published, "c", 50.0),
     ):
         rounds.report(harm)
         rounds.run()
         assert len(street.west().tile("west").lights) == 1
     with capture_logs() as lines:
-        rounds.report(Harm("west", published, "c", 2.1))
+        rounds.report(BitsIncrease("west", published, "c", 2.1))
         rounds.run()
     assert [(line["event"], line["vehicle"]) for line in lines] == [("update withdrawn", "c")]
     assert street.west().tile("west").lights == ()
@@ -149,10 +149,10 @@ def test_a_reported_harm_withdraws_what_it_names_if_it_is_large(
 
 def test_the_process_takes_reports(street: Any, published: str) -> None:
     learner = Learner(street.job, LogForm.JSON, lambda _: None)
-    learner.report(Harm("west", published, "c", 50.0))
+    learner.report(BitsIncrease("west", published, "c", 50.0))
     learner.start()
     try:
-        learner.report(Harm("west", published, "c", 50.0))
+        learner.report(BitsIncrease("west", published, "c", 50.0))
         assert learner._process is not None
         assert learner._process.stdin is not None
         deadline_s = WAIT_S

@@ -13,8 +13,8 @@ from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.wire.nats import (
     EXPIRES_S,
     NatsServers,
-    VehiclePlace,
-    VehiclePlaces,
+    VehicleLocation,
+    VehicleLocations,
     key_of,
     picture_subject,
     pictures_subject,
@@ -29,8 +29,8 @@ NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", fullmatch=True)
 
 def place(
     server: str = "east", session: str = "s1", opened: int = 1, epoch: int = 0
-) -> VehiclePlace:
-    return VehiclePlace("cav-1", server, session, opened, epoch, "street", "ab" * 32)
+) -> VehicleLocation:
+    return VehicleLocation("cav-1", server, session, opened, epoch, "street", "ab" * 32)
 
 
 # --- subjects and keys
@@ -84,13 +84,13 @@ def test_a_subject_that_is_none_of_pictures_is_refused() -> None:
     tile=st.one_of(st.just(""), NAMES),
 )
 def test_a_place_is_one_line_that_reads_back(**values: Any) -> None:
-    given_place = VehiclePlace(
+    given_place = VehicleLocation(
         values["vehicle"], values["server"], values["session"], values["opened"],
         values["epoch"], values["tile"], "cd" * 32,
     )  # fmt: skip
     text = given_place.encode()
     assert b"\n" not in text
-    assert VehiclePlace.decode(text) == given_place
+    assert VehicleLocation.decode(text) == given_place
 
 
 @pytest.mark.parametrize(
@@ -103,13 +103,13 @@ def test_a_place_is_one_line_that_reads_back(**values: Any) -> None:
 def test_an_impossible_place_is_refused(change: dict[str, Any]) -> None:
     text = json.dumps({**asdict(place()), **change}).encode()
     with pytest.raises(ProtocolError, match="impossible place"):
-        VehiclePlace.decode(text)
+        VehicleLocation.decode(text)
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"null", b'{"vehicle_id": "cav-1"}', b"\xff"])
 def test_what_is_no_record_is_refused(data: bytes) -> None:
     with pytest.raises(ProtocolError, match="impossible place"):
-        VehiclePlace.decode(data)
+        VehicleLocation.decode(data)
 
 
 # --- who wins
@@ -123,19 +123,19 @@ PLACES = st.builds(
 )
 
 
-def of_sessions(places: list[VehiclePlace]) -> list[VehiclePlace]:
+def of_sessions(places: list[VehicleLocation]) -> list[VehicleLocation]:
     """One place a session: the last that is told of it."""
     return list({each.session: each for each in places}.values())
 
 
 @given(places=st.lists(PLACES, min_size=1, max_size=8), order=st.randoms(use_true_random=False))
 def test_whatever_the_order_of_arrival_the_newest_session_wins(
-    places: list[VehiclePlace], order: Any
+    places: list[VehicleLocation], order: Any
 ) -> None:
     sessions = of_sessions(places)
     arrived = sessions * 2
     order.shuffle(arrived)
-    heard, known = VehiclePlaces(), list[VehiclePlace]()
+    heard, known = VehicleLocations(), list[VehicleLocation]()
     for each in arrived:
         known.append(each)
         newest = max(known, key=lambda it: it.rank)
@@ -145,11 +145,11 @@ def test_whatever_the_order_of_arrival_the_newest_session_wins(
 
 @given(places=st.lists(PLACES, min_size=1, max_size=8), ended=st.integers(0, 7))
 def test_a_session_that_ended_stays_ended_and_the_next_newest_takes_over(
-    places: list[VehiclePlace], ended: int
+    places: list[VehicleLocation], ended: int
 ) -> None:
     sessions = of_sessions(places)
     over = sessions[ended % len(sessions)]
-    heard = VehiclePlaces()
+    heard = VehicleLocations()
     for each in sessions:
         heard.hear(each, 0.0)
     heard.end(over, 0.0)
@@ -159,7 +159,7 @@ def test_a_session_that_ended_stays_ended_and_the_next_newest_takes_over(
 
 
 def test_a_server_that_fell_silent_loses_its_vehicles_to_one_that_did_not() -> None:
-    heard = VehiclePlaces()
+    heard = VehicleLocations()
     dead, alive = place("east", opened=2), place("west", opened=1)
     assert heard.hear(dead, 0.0)
     assert not heard.hear(alive, 1.0)
@@ -173,13 +173,13 @@ def test_a_server_that_fell_silent_loses_its_vehicles_to_one_that_did_not() -> N
 
 
 def test_of_vehicles_and_sessions_that_are_over_nothing_is_kept() -> None:
-    heard = VehiclePlaces()
+    heard = VehicleLocations()
     for number in range(100):
         each = replace(place(session=f"s{number}"), vehicle_id=f"cav-{number}")
         heard.hear(each, 0.0)
         heard.end(each, 0.0)
     heard.expire(2 * EXPIRES_S)
-    assert vars(heard) == vars(VehiclePlaces())
+    assert vars(heard) == vars(VehicleLocations())
 
 
 # --- how NATS is reached
