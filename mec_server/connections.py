@@ -192,7 +192,7 @@ class Connections:
             self._notes[peer].is_exempt = True
 
     def offend(self, peer: str, limit: Limit, now: float) -> None:
-        """ClosedConnections a connection and bar its address at once. ``peer``: empty for one that is gone.
+        """Close a connection and bar its address at once; do nothing for an empty ``peer``.
 
         About 10 us a connection: not for what may happen often.
         """

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import suppress
 
 import grpc
@@ -17,8 +17,7 @@ import grpc
 from mec_server.ledger.entry import StreamAccount
 from mec_server.metrics import BackgroundTask
 from mec_server.peers import abort, peer_account
-from mec_server.stream import Context, Stream
-from mec_server.stream_decoders import ServerContext
+from mec_server.stream import Context, ServerContext, Stream
 from rfcore.errors import LimitExceeded
 from rfcore.wire.conventions import STREAM_METHOD
 
@@ -102,7 +101,7 @@ class EdgeService:
         session_id: str,
         account: StreamAccount,
     ) -> None:
-        stream = Stream(self._server, context, session_id, account, self._reallocate_rates)
+        stream = Stream(self._server, context, session_id, account, self._regrant)
         self._streams.add(stream)
         self._server.metrics.sessions.inc()
         try:
@@ -120,9 +119,8 @@ class EdgeService:
                 self._server.metrics.count_limited(end.error.limit)
             await abort(context, end.error)
 
-    def _reallocate_rates(self) -> None:
-        """Tell vehicles whose rate changes."""
-        changed = self._server.entry.reallocate_rates(time.monotonic())
-        if changed:
-            for stream in self._streams:
-                stream.regrant(changed)
+    def _regrant(self, rates_hz: Mapping[str, float]) -> None:
+        """Tell the vehicles of these sessions their new rates."""
+        for stream in self._streams:
+            if stream.session_id in rates_hz:
+                stream.grant(rates_hz[stream.session_id])

@@ -27,6 +27,7 @@ from pathlib import Path
 
 import structlog
 
+from mec_server.config import ServerConfig
 from mec_server.event_loop import Workers, work_when_idle
 from mec_server.tile_history import LEARNING, TileHistory, read_histories
 from mec_server.tile_learning import (
@@ -48,7 +49,7 @@ from rfcore.update.run import LearnAs
 from rfcore.views import PosedPicture
 from rfcore.wire.settings import LogForm, configure_logs
 
-__all__ = ["ONE_THREAD", "Learner", "UnrecordedTrials", "main"]
+__all__ = ["Learner", "Learning", "UnrecordedTrials", "main"]
 
 log = structlog.get_logger()
 
@@ -126,6 +127,55 @@ class Learner:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+class Learning:
+    """The learning process of a server, and ``trials`` on vehicles that are not recorded.
+
+    ``open_field`` opens fields for the thread of the trials; ``failed`` is called with what went
+    wrong there; ``show`` is given what was learnt, by tile, with each look.
+    """
+
+    def __init__(
+        self,
+        config: ServerConfig,
+        open_field: Callable[[str], RadianceField],
+        failed: Callable[[Exception], None],
+        show: Callable[[Mapping[str, TileHistory]], None],
+    ) -> None:
+        settings, recordings = config.learn, config.record.folder
+        assert recordings is not None
+        job = LearningJob(
+            config.fields,
+            recordings,
+            settings.learn_as,
+            settings.min_identities,
+            cpu_s_per_h=settings.cpu_s_per_h,
+            max_bytes=round(settings.max_gb * 1e9),
+            max_age_s=settings.max_age_h * 3600,
+            quiet_s=settings.quiet_s,
+            max_field_bytes=config.render.max_field_bytes,
+        )
+        self._show = show
+        self._learner = Learner(job, config.log, self._take_up)
+        self.trials = UnrecordedTrials(open_field, failed, self._learner.report)
+
+    def start(self) -> None:
+        """Start the process."""
+        self._learner.start()
+
+    def look(self) -> None:
+        """Start the process again if it has ended, and show what was learnt; raise ``OSError``."""
+        self._learner.look()
+
+    def close(self) -> None:
+        """End the trials and the process."""
+        self.trials.close()
+        self._learner.close()
+
+    def _take_up(self, histories: Mapping[str, TileHistory]) -> None:
+        self.trials.watch(histories)
+        self._show(histories)
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,28 @@
-"""Reconstruction of one session's frames: render, convert, splice, decode; on worker threads.
+"""Reconstruction of one stream's frames: render, convert, splice, decode; on worker threads.
 
-Nothing here knows asyncio or gRPC. One ``CameraDecoder`` is used by one thread at a time, since a
-session decodes one frame of a camera at a time.
+``StreamDecoders`` opens the decoders of a stream for its Hello, runs them on the server's workers
+and closes them with the stream; it is used from the event loop. ``CameraDecoder`` does the work for
+one camera; one thread uses it at a time, since a session decodes one frame of a camera at a time.
 """
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 from mec_server.decoding.decoders import OpenDecoder
-from mec_server.session import DecodeJob, DecodeOutcome, OpenJob
+from mec_server.event_loop import Workers
+from mec_server.ledger.ledger import Hold
+from mec_server.metrics import BackgroundTask, OpeningResult, ServerMetrics
+from mec_server.recorder import Recorder, SessionRecording
+from mec_server.session import DecodeJob, OpenJob, RenderTooLate
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason
+from rfcore.codec.h264.splice import PictureDecoder
+from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason, RfedgeError
 from rfcore.field import CodecPictureRenderer, Renderer
 from rfcore.image import I420
 from rfcore.native.yuv import field_view_from_view
@@ -23,9 +32,11 @@ from rfcore.wire.messages import CameraDescription, StageTimes
 __all__ = [
     "CameraDecoder",
     "Decoder",
+    "DecodingParts",
     "FieldSource",
     "OpenCameras",
     "Reconstruction",
+    "StreamDecoders",
     "Tools",
     "open_cameras",
 ]
@@ -42,7 +53,7 @@ class FieldSource(Protocol):
 
 @dataclass(frozen=True)
 class Tools:
-    """A clock for the times of stages, and what opens H.264 decoders."""
+    """The clock that stages are timed by, and the function that opens H.264 decoders."""
 
     clock_ns: ClockNs
     open_decoder: OpenDecoder
@@ -50,14 +61,17 @@ class Tools:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A frame, identical to the one in the vehicle's closed loop, and its ``outcome``.
+    """A picture, identical to the one in the vehicle's closed loop, and its ``digest``.
 
-    ``render``: what the field shows there, at the frame's quality; ``None`` where nothing was
-    rendered, as for a camera that is lost, and where a device did and kept the colours.
+    ``times``: of the stages. ``exact``: false when the two renders differed by rounding, and the
+    pictures with them. ``render``: the field's view there, at the frame's quality; None where
+    nothing was rendered, as for a camera that is lost, and where a device kept the colours.
     """
 
     picture: I420
-    outcome: DecodeOutcome
+    digest: bytes
+    times: StageTimes
+    exact: bool = True
     render: View | None = None
 
 
@@ -113,12 +127,13 @@ class CameraDecoder:
             decode_ns=decoded.stage_ns.get("decode", 0),
         )
         digest = decoded.state.kept[0].digest
-        outcome = DecodeOutcome(digest, times, decoded.exact)
-        return Reconstruction(decoded.frame, outcome, render)
+        return Reconstruction(decoded.frame, digest, times, decoded.exact, render)
 
     def _render(self, job: DecodeJob) -> tuple[View | None, FieldView]:
-        """Return what the field shows at the frame's pose, where the CPU has it, and that as the
-        codec holds it; nothing of either if the camera is lost."""
+        """Return the field's view at the frame's pose, and its form for the codec.
+
+        The view is None where only a device has it, and where the camera is lost.
+        """
         camera = job.frame.camera(self._camera.intrinsics)
         if camera is None:
             return None, FieldView.nothing(self._camera.intrinsics)
@@ -151,3 +166,183 @@ def open_cameras(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, D
             name = f"hello.cameras[{index}].{error.field}"
             raise InvalidInput(name, error.problem) from error
     return decoders
+
+
+@dataclass(frozen=True)
+class DecodingParts:
+    """The parts of a server that decode the frames of all streams."""
+
+    fields: FieldSource
+    workers: Workers
+    """Threads that decode frames."""
+    background: Workers
+    """One thread for frames of identities whose frames were rejected lately; it gives way to the
+    threads above where processors are scarce, since a render cannot be interrupted."""
+    opener: Workers
+    """One thread that opens fields and decoders for new vehicles: a crowd of them, or a decoder
+    process that is slow to start, must not delay the frames of others."""
+    tools: Tools
+    metrics: ServerMetrics
+    render_deadline_s: float
+    open_cameras: OpenCameras = open_cameras
+    recorder: Recorder | None = None
+
+
+class OpeningCancelled(RfedgeError):
+    """The stream is over; its decoders are not wanted any more."""
+
+
+Finished = Callable[[DecodeJob, Reconstruction | Exception, float], None]
+"""Takes the outcome of a job (``PacketRejected``, or an unexpected exception) and the seconds for
+which it kept a worker busy."""
+
+
+class StreamDecoders:
+    """Decodes the frames of one stream; used from the event loop only.
+
+    Streams of the same ``owner`` take one turn together at the workers and at the opener.
+    """
+
+    def __init__(self, parts: DecodingParts, session_id: str) -> None:
+        self._parts = parts
+        self._session_id = session_id
+        self._owner = ""
+        self._recording: SessionRecording | None = None
+        self._decoders: dict[str, Decoder] = {}
+        self._held: Hold | None = None
+        self._closed = False
+
+    async def open(self, owner: str, job: OpenJob, held: Hold) -> None:
+        """Open fields and decoders for ``job``, on a thread that delays no frames.
+
+        ``held``, which the decoders are charged as, is released when the last of them is closed.
+        Cancelled, it opens no more decoders and closes those that are open. Raises what
+        ``OpenCameras`` raises.
+        """
+        opened: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+        def done(outcome: dict[str, Decoder] | Exception) -> None:
+            self._count_opening(outcome)
+            if isinstance(outcome, dict) and outcome:
+                self._decoders, self._held = outcome, held
+                if self._closed:
+                    self._close_decoders()
+            else:
+                held.release()
+            if opened.done():
+                return
+            if isinstance(outcome, Exception):
+                opened.set_exception(outcome)
+            else:
+                opened.set_result(None)
+
+        self._parts.opener.submit(owner, partial(self._open_cameras, job), done)
+        try:
+            await opened
+        except asyncio.CancelledError:
+            self._closed = True
+            raise
+        self._owner = owner
+
+    def submit(
+        self,
+        job: DecodeJob,
+        expected_s: float,
+        finished: Finished,
+        *,
+        in_background: bool = False,
+    ) -> None:
+        """Decode a frame on a worker, then call ``finished`` on the loop; never after ``close``.
+
+        ``expected_s``: how long the frame will keep the worker busy. One that would end after its
+        deadline is rejected (``RenderTooLate``) when its turn comes, before it is rendered.
+        """
+
+        def done(outcome: tuple[Reconstruction | PacketRejected, float] | Exception | None) -> None:
+            if self._closed or outcome is None:
+                return
+            if isinstance(outcome, Exception):
+                finished(job, outcome, 0.0)
+            else:
+                finished(job, *outcome)
+
+        workers = self._parts.background if in_background else self._parts.workers
+        workers.submit(self._owner, partial(self._reconstruct, job, expected_s), done)
+
+    def close(self) -> None:
+        """Close the decoders on threads, those that are still being opened included."""
+        self._closed = True
+        self._close_decoders()
+
+    def _open_cameras(self, job: OpenJob) -> dict[str, Decoder]:
+        """Runs on the opener; the decoders of a stream that is over are not opened any more."""
+        parts = self._parts
+
+        def open_decoder(size_px: tuple[int, int]) -> PictureDecoder:
+            self._check_wanted()
+            return parts.tools.open_decoder(size_px)
+
+        self._check_wanted()
+        if parts.recorder is not None:
+            self._recording = parts.recorder.session(self._session_id, job.hello)
+        tools = replace(parts.tools, open_decoder=open_decoder)
+        return parts.open_cameras(job, parts.fields, tools)
+
+    def _check_wanted(self) -> None:
+        if self._closed:
+            raise OpeningCancelled("the stream ended before its decoders were open")
+
+    def _count_opening(self, outcome: dict[str, Decoder] | Exception) -> None:
+        metrics = self._parts.metrics
+        if isinstance(outcome, OpeningCancelled) or self._closed:
+            metrics.count_opening(OpeningResult.CANCELLED)
+        elif isinstance(outcome, Exception):
+            metrics.count_opening(OpeningResult.FAILED)
+        else:
+            metrics.count_opening(OpeningResult.OPENED)
+        if isinstance(outcome, Exception) and not isinstance(outcome, RfedgeError):
+            metrics.task_failed(BackgroundTask.OPENING, outcome)
+
+    def _close_decoders(self) -> None:
+        decoders, self._decoders = self._decoders, {}
+        held, self._held = self._held, None
+        if held is None:
+            return
+        loop = asyncio.get_running_loop()
+        closing = [
+            loop.run_in_executor(None, self._close_decoder, decoder)
+            for decoder in decoders.values()
+        ]
+        asyncio.gather(*closing).add_done_callback(lambda _: held.release())
+
+    def _close_decoder(self, decoder: Decoder) -> None:
+        try:
+            decoder.close()
+        except Exception as error:
+            self._parts.metrics.task_failed(BackgroundTask.CLOSING, error)
+
+    def _reconstruct(
+        self, job: DecodeJob, expected_s: float
+    ) -> tuple[Reconstruction | PacketRejected, float] | None:
+        """Return the outcome of a frame and how long it kept the worker, which this runs on, busy.
+
+        Frames of a stream that is over are not decoded any more.
+        """
+        if self._closed:
+            return None
+        started_s = time.perf_counter()
+        try:
+            self._check_deadline(job, expected_s)
+            reconstruction = self._decoders[job.frame.camera_id].reconstruct(job)
+        except PacketRejected as error:
+            return error, time.perf_counter() - started_s
+        worker_s = time.perf_counter() - started_s
+        if self._recording is not None:
+            self._recording.save(job.frame, job.field_id, reconstruction.picture)
+        return reconstruction, worker_s
+
+    def _check_deadline(self, job: DecodeJob, expected_s: float) -> None:
+        waited_s = time.monotonic() - job.received_s
+        deadline_s = self._parts.render_deadline_s
+        if waited_s + expected_s > deadline_s:
+            raise RenderTooLate(waited_s, expected_s, deadline_s)

@@ -17,10 +17,12 @@ from __future__ import annotations
 import queue
 import shutil
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from mec_server.config import RecordSettings
 from rfcore.camera import Pose, TileOrigin
 from rfcore.dataset.recorded_session import (
     RECORDING_NAME,
@@ -40,6 +42,7 @@ __all__ = [
     "Recorder",
     "RecordingQuota",
     "SessionRecording",
+    "open_recorder",
     "picture_name",
 ]
 
@@ -63,12 +66,22 @@ class KeepLimits:
 
 @dataclass(frozen=True)
 class FieldTiles:
-    """Where the tile of a field is, and what it is called: both by the field's id."""
+    """Functions that return the origin and the name of the tile of a field, by the field's id."""
 
     origin_of: Callable[[str], TileOrigin]
     """Raises ``UnknownField`` for a field that is not held."""
     name_of: Callable[[str], str]
     """Empty for a field of no published tile."""
+
+
+def open_recorder(
+    settings: RecordSettings, tiles: FieldTiles, failed: Callable[[Exception], None]
+) -> Recorder | None:
+    """Return the recorder that ``settings`` ask for, if they do; see ``Recorder``."""
+    if settings.folder is None:
+        return None
+    limits = KeepLimits(round(settings.max_gb * 1e9), settings.max_age_h * 3600)
+    return Recorder(settings.folder, limits, tiles, lambda: time.time_ns() // 1_000_000, failed)
 
 
 class RecordingQuota:

@@ -51,7 +51,6 @@ from rfcore.wire.notices import StreetNotice
 
 __all__ = [
     "DecodeJob",
-    "DecodeOutcome",
     "OpenJob",
     "RenderTooLate",
     "ServerSession",
@@ -85,18 +84,6 @@ class DecodeJob:
     field_id: str
     received_s: float
     started_s: float
-
-
-@dataclass(frozen=True)
-class DecodeOutcome:
-    """A reconstructed frame: its digest and the time it took.
-
-    ``exact`` is false when the renders differed by rounding, and with them the pictures.
-    """
-
-    reconstruction_digest: bytes
-    times: StageTimes
-    exact: bool = True
 
 
 @dataclass(frozen=True)
@@ -306,10 +293,10 @@ class ServerSession:
         self._deadline_s = now + self._limits.hello_s
         self._nack(FrameAddress("", 0, 0), RejectReason.INVALID_ARGUMENT, str(error))
 
-    def decoded(self, job: DecodeJob, outcome: DecodeOutcome, now: float) -> None:
-        """The frame of ``job`` was reconstructed."""
+    def decoded(self, job: DecodeJob, digest: bytes, times: StageTimes, now: float) -> None:
+        """Note that the frame of ``job`` was reconstructed, to a picture of ``digest``."""
         self._unusable = 0
-        address, times = job.frame.address, outcome.times
+        address = job.frame.address
         for gap in self._cameras.queue_of(job.frame).succeed():
             first = replace(address, sequence=gap.first)
             self._nack(first, RejectReason.SEQUENCE_GAP, "never arrived", gap.count)
@@ -320,7 +307,7 @@ class ServerSession:
             decode_ns=times.decode_ns,
             total_ns=_ns(now - job.received_s),
         )
-        self._say(Ack(address, times, outcome.reconstruction_digest))
+        self._say(Ack(address, times, digest))
         self._answered(now)
 
     def rejected(self, job: DecodeJob, error: PacketRejected, now: float) -> None:

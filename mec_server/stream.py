@@ -11,16 +11,21 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass
 
 import grpc
 import structlog
 
+from mec_server.config import SessionLimits
+from mec_server.connections import Connections
 from mec_server.decoding.process import DecoderLost
 from mec_server.event_loop import LazyTimer
+from mec_server.learner import UnrecordedTrials
 from mec_server.ledger.budgets import Limit
-from mec_server.ledger.entry import StreamAccount
-from mec_server.ledger.peer_log import PeerLog
-from mec_server.reconstruction import Reconstruction
+from mec_server.ledger.entry import EntryControl, StreamAccount
+from mec_server.ledger.peer_log import LogLimiter, PeerLog
+from mec_server.metrics import ServerMetrics
+from mec_server.reconstruction import DecodingParts, Reconstruction, StreamDecoders
 from mec_server.session import (
     DecodeJob,
     OpenJob,
@@ -29,8 +34,7 @@ from mec_server.session import (
     SessionState,
     StreamEnd,
 )
-from mec_server.stream_decoders import FrameResult, ServerContext, StreamDecoders
-from mec_server.twin.state import ReceivedPicture
+from mec_server.twin.state import ReceivedPicture, Twin
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
 from rfcore.wire.conventions import AGENT_PROCESS
@@ -40,7 +44,7 @@ from rfcore.wire.identity import peer_identity
 from rfcore.wire.messages import Frame, Hello
 from rfcore.wire.notices import StreetNotice
 
-__all__ = ["Context", "Stream"]
+__all__ = ["Context", "ServerContext", "Stream"]
 
 log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[bytes, bytes]
@@ -53,11 +57,26 @@ UNKNOWN_VEHICLE = ""
 """The vehicle id under which a stream is counted until its Hello is accepted."""
 
 
-class Stream:
-    """Serves one session. ``reallocate_rates`` is called after each frame, when the time that
-    frames take has changed. ``account`` is charged; who made it closes it.
+@dataclass(frozen=True)
+class ServerContext:
+    """The parts of one server that its streams share."""
 
-    It is a ``mec_server.ledger.entry.CameraSender``.
+    decoding: DecodingParts
+    held_field_ids: Callable[[], tuple[str, ...]]
+    metrics: ServerMetrics
+    limits: SessionLimits
+    entry: EntryControl
+    log_limiter: LogLimiter
+    connections: Connections
+    twin: Twin
+    trials: UnrecordedTrials | None = None
+
+
+class Stream:
+    """Serves one session; a ``mec_server.ledger.entry.CameraSender``.
+
+    ``account`` is charged; who made it closes it. ``regrant`` is called with the sessions whose
+    rate changes, after a frame has changed what frames cost.
     """
 
     def __init__(
@@ -66,11 +85,11 @@ class Stream:
         context: Context,
         session_id: str,
         account: StreamAccount,
-        reallocate_rates: Callable[[], None],
+        regrant: Callable[[Mapping[str, float]], None],
     ) -> None:
         self.agent = _agent_process(context)
         self._server = server
-        self._reallocate_rates = reallocate_rates
+        self._regrant = regrant
         self._context = context
         self._wake = asyncio.Event()
         self._timer = LazyTimer(self._wake)
@@ -83,7 +102,7 @@ class Stream:
         self.is_stalled = False
         self._writing_since_s: float | None = None
         self._is_closed = False
-        self._decoders = StreamDecoders(server, session_id)
+        self._decoders = StreamDecoders(server.decoding, session_id)
         self._intrinsics: dict[str, Intrinsics] = {}
         self._fault: Exception | None = None
         self._metrics = server.metrics.of(UNKNOWN_VEHICLE)
@@ -146,14 +165,12 @@ class Stream:
         self._session.tell(notice)
         self._wake.set()
 
-    def regrant(self, changed: Mapping[str, float]) -> None:
-        """Tell the vehicle its new rate, if it is among ``changed``."""
-        rate_hz = changed.get(self._session.session_id)
-        if rate_hz is not None:
-            self._log.info("rate granted", rate_hz=rate_hz)
-            self._account.grant(rate_hz, time.monotonic())
-            self._session.grant(rate_hz)
-            self._wake.set()
+    def grant(self, rate_hz: float) -> None:
+        """Tell the vehicle its new rate."""
+        self._log.info("rate granted", rate_hz=rate_hz)
+        self._account.grant(rate_hz, time.monotonic())
+        self._session.grant(rate_hz)
+        self._wake.set()
 
     def silent_s(self, now: float) -> float:
         """Return for how long the vehicle has sent nothing; 0 while it waits for an answer."""
@@ -345,40 +362,49 @@ class Stream:
     def _expect(self, job: DecodeJob) -> None:
         camera = job.frame.camera(self._intrinsics[job.frame.camera_id])
         if camera is not None:
-            self._server.expect_picture(job.field_id, camera)
+            self._server.twin.expect(job.field_id, camera)
 
     # --- outcomes of frames, on the event loop
 
-    def _finished(self, job: DecodeJob, outcome: FrameResult | Exception) -> None:
+    def _finished(
+        self, job: DecodeJob, outcome: Reconstruction | Exception, worker_s: float
+    ) -> None:
         try:
-            if isinstance(outcome, Exception):
-                raise outcome
-            now = time.monotonic()
-            complete = isinstance(outcome.reconstruction, Reconstruction)
-            self._account.worked(job.field_id, outcome.worker_s, now, complete=complete)
-            self._reallocate_rates()
-            if isinstance(outcome.reconstruction, Reconstruction):
-                self._reconstructed(job, outcome.reconstruction, now)
-            else:
-                self._rejected(job, outcome.reconstruction, outcome.worker_s, now)
+            self._take_outcome(job, outcome, worker_s, time.monotonic())
         except Exception as error:  # a programming error ends the stream that met it, loudly
             self._fault = error
             self._wake.set()
         else:
             self._advance()
 
-    def _reconstructed(self, job: DecodeJob, reconstruction: Reconstruction, now: float) -> None:
-        outcome = reconstruction.outcome
-        self._session.decoded(job, outcome, now)
+    def _take_outcome(
+        self, job: DecodeJob, outcome: Reconstruction | Exception, worker_s: float, now: float
+    ) -> None:
+        if isinstance(outcome, Exception) and not isinstance(outcome, PacketRejected):
+            raise outcome
+        is_complete = isinstance(outcome, Reconstruction)
+        self._account.worked(job.field_id, worker_s, now, complete=is_complete)
+        changed = self._server.entry.reallocate_rates(now)
+        if changed:
+            self._regrant(changed)
+        if isinstance(outcome, Reconstruction):
+            self._reconstructed(job, outcome, now)
+        else:
+            self._rejected(job, outcome, worker_s, now)
+
+    def _reconstructed(self, job: DecodeJob, made: Reconstruction, now: float) -> None:
+        self._session.decoded(job, made.digest, made.times, now)
         latency_s = self._latency_s(job)
-        if not outcome.exact:
+        if not made.exact:
             self._server.metrics.inexact.inc()
         self._server.metrics.count_picture(job.field_id, len(job.frame.packet.payload))
-        self._show(job, reconstruction, now, latency_s)
+        self._show(job, made, now, latency_s)
 
     def _latency_s(self, job: DecodeJob) -> float:
-        """Return the seconds since a frame's capture, by its own word if that can be; else since
-        its arrival: a clock that is wrong makes no age, and no sum, wrong."""
+        """Return the seconds since the capture time that the frame states, if that is plausible.
+
+        Otherwise return those since its arrival: a wrong clock makes no age or sum wrong.
+        """
         claimed_s = (time.time_ns() - job.frame.capture_time_ns) / 1e9
         if not -MAX_AHEAD_S <= claimed_s <= MAX_BEHIND_S:
             self._server.metrics.implausible_captures.inc()
@@ -410,27 +436,25 @@ class Stream:
             problem=error.problem,
         )
 
-    def _show(
-        self, job: DecodeJob, reconstruction: Reconstruction, now: float, latency_s: float
-    ) -> None:
+    def _show(self, job: DecodeJob, made: Reconstruction, now: float, latency_s: float) -> None:
         hello, session = self._session.hello, self._session
         if hello is None or session.closed is not None:
             return
-        shown = ReceivedPicture(
+        picture = ReceivedPicture(
             vehicle_id=hello.vehicle_id,
             session_id=session.session_id,
             frame=job.frame,
             intrinsics=self._intrinsics[job.frame.camera_id],
             field_id=job.field_id,
-            picture=reconstruction.picture,
-            digest=reconstruction.outcome.reconstruction_digest,
+            picture=made.picture,
+            digest=made.digest,
             reconstructed_s=now,
             latency_s=latency_s,
             opened_time_ns=self._opened_time_ns,
         )
-        self._server.twin.show(shown, reconstruction.render)
+        self._server.twin.show(picture, made.render)
         if self._server.trials is not None and not hello.allow_recording:
-            self._server.trials.saw(shown)
+            self._server.trials.saw(picture)
 
 
 def _agent_process(context: Context) -> str:

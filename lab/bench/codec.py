@@ -31,9 +31,7 @@ import numpy as np
 
 from lab.bench.street import street_camera, street_gaussians
 from mec_server.config import DecoderKind
-from mec_server.decoding.decoders import Decoders, DecoderSettings
-from mec_server.decoding.process import LossCause
-from mec_server.ledger.peer_log import LogLimiter
+from mec_server.decoding.decoders import Decoders
 from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
@@ -96,18 +94,14 @@ def decoder_rows() -> list[DecoderRow]:
 
 
 def _decoder(kind: DecoderKind, drive: PrerecordedDrive, opened: ExitStack) -> DeltaDecoder:
-    decoders = Decoders(
-        DecoderSettings(kind, as_root=True), _fail, lambda _: None, LogLimiter()
-    )  # taking the spare raises
-    decoders.start()
-    opened.callback(decoders.close)
+    decoders = opened.enter_context(Decoders(kind, as_root=True, count_loss=_fail))
     header = drive.hello.cameras[0].codec
     decoder = DeltaDecoder(header, True, perf_counter_ns, decoders.open)
     opened.callback(decoder.close)
     return decoder
 
 
-def _fail(cause: LossCause) -> None:
+def _fail(cause: str) -> None:
     raise RfedgeError(f"a decoder process was lost ({cause}) on a sample that decodes")
 
 

@@ -21,7 +21,7 @@ from mec_server.event_loop import FairQueue
 from mec_server.ledger.budgets import budgets_of
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.ledger import Hold
-from mec_server.session import DecodeJob, DecodeOutcome, OpenJob, RenderTooLate, ServerSession
+from mec_server.session import DecodeJob, OpenJob, RenderTooLate, ServerSession
 from rfcore.errors import LimitExceeded
 from rfcore.link import Link, LinkProfile
 from rfcore.wire.convert import client_message_from_bytes
@@ -256,7 +256,7 @@ class ServerStream:
         self.account.worked(job.field_id, server.costs.server_s, now)
         server.reallocate()
         times = StageTimes(render_ns=round(1e9 * server.costs.server_s))
-        self.session.decoded(job, DecodeOutcome(DIGEST, times), now)
+        self.session.decoded(job, DIGEST, times, now)
         if server.counted.on:
             server.counted.ages_s.append(now - job.frame.capture_time_ns / 1e9)
         self._advance()

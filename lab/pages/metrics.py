@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry
 from cav_agent.metrics import AgentMetrics
 from mec_server.metrics import ServerMetrics
 from mec_server.twin.metrics import TwinMetrics
+from mec_server.twin.state import Twin
 from rfcore.wire.instruments import Family
 from rfedge.link.metrics import LinkMetrics
 
@@ -37,7 +38,7 @@ def families() -> Mapping[str, Sequence[Family]]:
     agent.identify("cav-1", "front")
     agent.field_ready("0" * 16, "splats")
     server = ServerMetrics(CollectorRegistry(), per_vehicle=True)
-    TwinMetrics(server.instruments, dict, int, per_vehicle=True)
+    TwinMetrics(server.instruments, Twin(), per_vehicle=True)
     return {
         "mec-server": server.instruments.families,
         "cav-agent": agent.instruments.families,

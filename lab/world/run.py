@@ -21,8 +21,6 @@ from lab.servers.cases import WorldRow, print_world
 from lab.world import EvalWorld
 from lab.world.objects import AnnotatedPicture, dusk_rows, object_rows, received
 from lab.world.truth import Drive, SceneTruth, aside
-from mec_server.event_loop import work_when_idle
-from mec_server.learner import ONE_THREAD
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, load_field
@@ -53,6 +51,7 @@ __all__ = ["run_world"]
 MAX_AGE_S = 2.0
 LIVE_AGE_S = 0.1
 """How old the picture is that a view is composed of."""
+ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 LEAST_TOLD_S = 1e-3
 """To this a notice's ``unseen_s`` is rounded."""
 CHANGED_LEVELS, LEAST_CHANGED = 16, 0.002
@@ -406,7 +405,7 @@ def _learning(asked: EvalWorld, drive: Path) -> Iterator[None]:
             stdout=file,
             stderr=file,
             env={**os.environ, **ONE_THREAD},
-            preexec_fn=work_when_idle,
+            preexec_fn=lambda: os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)),
         )
     try:
         yield

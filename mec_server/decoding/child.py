@@ -6,6 +6,18 @@ forks a decoder process for each, which takes milliseconds where a start of Pyth
 0.3 s of a processor. A decoder process confines itself (``rfcore.confinement``) before it reads
 the first byte that comes from a vehicle, and ends when its socket is closed. The limit of CPU time
 is for one request and is moved on before each.
+
+*Protocol.* A request is a command and its numbers, one message of a SOCK_SEQPACKET socket; the
+answer is ``DONE``, or ``FAILED`` and an error text. Access units stand one after the other at the
+start of the shared memory, a decoded picture (I420, plane after plane, of the size given by OPEN)
+at ``OUTPUT_AT``. The memory is a sealed memfd: it cannot shrink under its reader, is on no disk,
+and only pages in use take memory.
+
+The fork server has a socket of the same kind. A message with three descriptors (socket, memory,
+file for errors) forks a process; the answer is ``DONE`` with its process number in the fork
+server's namespace and, as a descriptor, its pidfd (pidfd_open(2)). A message with such a number
+reaps a process that ended or was killed; the answer is ``DONE`` with its exit status, negative for
+a signal. A failure is answered as above.
 """
 
 from __future__ import annotations
@@ -15,30 +27,36 @@ import mmap
 import os
 import resource
 import socket
+import struct
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
+from enum import IntEnum
 from typing import NoReturn
 
 import numpy as np
 
-from mec_server.decoding.protocol import (
-    DONE,
-    FAILED,
-    MAX_ANSWER_BYTES,
-    MAX_REQUEST_BYTES,
-    MEMORY_BYTES,
-    NUMBER,
-    OUTPUT_AT,
-    DecoderCommand,
-    request_from_bytes,
-)
+from rfcore.codec.h264.config import MAX_MACROBLOCKS
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.confinement.confine import Confinement, ProcessLimits, confine
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
-__all__ = ["DECODER_NAME", "LIMITS", "REQUEST_CPU_S", "main"]
+__all__ = [
+    "DECODER_NAME",
+    "DONE",
+    "FAILED",
+    "INPUT_BYTES",
+    "LIMITS",
+    "MAX_ANSWER_BYTES",
+    "MEMORY_BYTES",
+    "NUMBER",
+    "OUTPUT_AT",
+    "REQUEST_CPU_S",
+    "DecoderCommand",
+    "main",
+    "request_to_bytes",
+]
 
 LIMITS = ProcessLimits(address_space_bytes=1 << 30)
 """0.2 GiB is the interpreter; a 4096x2304 picture is 14 MB, and FFmpeg holds some twenty."""
@@ -49,6 +67,42 @@ DECODER_NAME, FORK_SERVER_NAME = "decoder", "decoder-forks"
 """What the processes are called in lists of processes (``ps -o comm``)."""
 
 PR_SET_NAME = 15
+
+
+SAMPLES_PER_MACROBLOCK = 384
+
+INPUT_BYTES = MAX_MACROBLOCKS * SAMPLES_PER_MACROBLOCK * 3 // 2 + (1 << 20)
+"""The largest I_PCM picture, all of it escaped (7.4.1), with parameter sets and syntax to spare."""
+
+OUTPUT_AT = (INPUT_BYTES + 4095) // 4096 * 4096
+MEMORY_BYTES = OUTPUT_AT + MAX_MACROBLOCKS * SAMPLES_PER_MACROBLOCK
+
+DONE, FAILED = b".", b"!"
+NUMBER = struct.Struct("<i")
+"""A process number, or an exit status."""
+MAX_ANSWER_BYTES = 1024
+MAX_REQUEST_BYTES = 1 + 4 * 16
+
+
+class DecoderCommand(IntEnum):
+    """What a decoder process can be asked for: OPEN with width and height, RESET, and with the
+    lengths of access units FEED, which decodes them, and DECODE, which also returns the last."""
+
+    OPEN = 1
+    FEED = 2
+    DECODE = 3
+    RESET = 4
+
+
+def request_to_bytes(command: DecoderCommand, *numbers: int) -> bytes:
+    """Return a request as it is sent."""
+    return struct.pack(f"<B{len(numbers)}I", command, *numbers)
+
+
+def request_from_bytes(data: bytes) -> tuple[DecoderCommand, tuple[int, ...]]:
+    """Return the command and its numbers."""
+    command, *numbers = struct.unpack(f"<B{(len(data) - 1) // 4}I", data)
+    return DecoderCommand(command), tuple(numbers)
 
 
 class DecoderChild:

@@ -25,7 +25,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import IO
 
-from mec_server.decoding.protocol import (
+from mec_server.decoding.child import (
     DONE,
     FAILED,
     MAX_ANSWER_BYTES,
@@ -65,7 +65,7 @@ SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
 class LossCause(StrEnum):
-    """How a decoder process ended."""
+    """The way in which a decoder process ended."""
 
     SIGNAL = "signal"
     EXIT = "exit"

@@ -148,6 +148,14 @@ class PublishedFields:
         self._seen = self._stamp()
         self._take(read_publication(self._folder))
 
+    def current(self) -> tuple[Tile, ...]:
+        """Return the tiles that are published now."""
+        return self.tiles
+
+    def names_of(self, field_id: str) -> frozenset[str]:
+        """Return the names of the published tiles that a field belongs to."""
+        return frozenset(tile.name for tile in self.tiles if field_id in tile.archive_ids)
+
     def name_of(self, field_id: str) -> str:
         """Return the name of the tile that a field is or was published for; empty for no tile's."""
         return self._names.get(field_id, "")

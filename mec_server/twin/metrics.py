@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from mec_server.twin.state import Twin
 from rfcore.wire.instruments import Family, Instruments
 from rfcore.wire.notices import NOTICE_KINDS, ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
@@ -49,15 +51,14 @@ class TwinMetrics:
     def __init__(
         self,
         make: Instruments,
-        ages_s: Callable[[], Mapping[str, float]],
-        missed: Callable[[], int],
+        twin: Twin,
         *,
         per_vehicle: bool = False,
     ) -> None:
         labels = ("vehicle",) if per_vehicle else ()
         age = Family(AGE.name, AGE.kind, AGE.text, labels)
-        make.collector(age, _Ages(age, ages_s))
-        make.collector(MISSED, _Counted(MISSED, missed))
+        make.collector(age, _Ages(age, lambda: twin.ages_s(time.monotonic())))
+        make.collector(MISSED, _Counted(MISSED, lambda: twin.missed))
         self.consumers = make.gauge("rfedge_twin_consumers", "Consumers that watch the twin.")
         self.ended = make.counter(
             "rfedge_twin_consumers_ended",

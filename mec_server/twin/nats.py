@@ -12,12 +12,17 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from itertools import count
+from pathlib import Path
 from typing import Final
 
 import structlog
 
-from mec_server.nats import NatsLink, places_bucket, together
+from mec_server.event_loop import repeat_forever
+from mec_server.fields.index import FieldIndex, PublishedFields
+from mec_server.metrics import BackgroundTask
+from mec_server.nats import FieldExchange, NatsLink, places_bucket, together
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.service import PictureEncoder, picture_message
 from mec_server.twin.state import ReceivedPicture, Twin
@@ -27,6 +32,7 @@ from rfcore.perception.objects import CameraKey
 from rfcore.wire.nats import (
     PLACE_HEADER,
     WANTED_S,
+    NatsServers,
     VehicleLocation,
     key_of,
     picture_subject,
@@ -43,7 +49,7 @@ with needs("nats"):
     from nats.js.errors import BadRequestError, KeyNotFoundError, KeyWrongLastSequenceError
     from nats.js.kv import KeyValue
 
-__all__ = ["PlaceRecords", "TwinPublisher"]
+__all__ = ["NatsServices", "PlaceRecords", "TwinPublisher"]
 
 log = structlog.get_logger()
 
@@ -54,6 +60,11 @@ PLACES_EVERY_S: Final = 2.0
 """How often the places are written again, well before they expire."""
 FAREWELL_S: Final = 1.0
 POLL_S: Final = 0.01
+AGAIN_S: Final = 0.1
+"""Delay before publishing begins, and before it begins anew after an unexpected exception."""
+FIELDS_S: Final = 20.0
+"""Longest wait at the start for fields that the server lacks and NATS may have."""
+END_S: Final = 2.0
 
 
 class TwinPublisher:
@@ -198,6 +209,65 @@ class TwinPublisher:
         while True:
             await records.write(self._places())
             await asyncio.sleep(PLACES_EVERY_S)
+
+
+class NatsServices:
+    """What a server does over NATS: it exchanges fields, and publishes pictures of vehicles.
+
+    ``failed`` is called with an unexpected exception of either; it begins anew then.
+    """
+
+    def __init__(
+        self,
+        servers: NatsServers,
+        folder: Path,
+        index: FieldIndex,
+        published: PublishedFields,
+        failed: Callable[[BackgroundTask, Exception], None],
+    ) -> None:
+        self._servers = servers
+        self._published = published
+        self._failed = failed
+        self._exchange = FieldExchange(
+            NatsLink(servers, "mec-server fields"),
+            folder,
+            index,
+            published.current,
+            published.look_again,
+        )
+        self._publisher: TwinPublisher | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+
+    async def bring_missing(self) -> None:
+        """Fetch fields that the folder's manifest names and lacks, as far as NATS has them."""
+        await self._exchange.bring_missing(FIELDS_S)
+
+    def publish(
+        self, name: str, twin: Twin, pictures: PictureEncoder, metrics: TwinMetrics
+    ) -> None:
+        """Publish the pictures of ``twin`` as server ``name``, and exchange fields, until left."""
+        link = NatsLink(
+            self._servers,
+            f"mec-server {name}",
+            lambda connected, _: metrics.nats_connected.set(connected),
+        )
+        tiles = self._published.current
+        self._publisher = TwinPublisher(link, name, twin, pictures, tiles, metrics)
+        for work, task in (
+            (self._publisher.run, BackgroundTask.NATS_TWIN),
+            (self._exchange.run, BackgroundTask.NATS_FIELDS),
+        ):
+            repeated = repeat_forever(work, AGAIN_S, partial(self._failed, task))
+            self._tasks.append(asyncio.create_task(repeated))
+
+    async def leave(self) -> None:
+        """Publish the departures of the streams that have just ended, and disconnect."""
+        if self._publisher is None:
+            return
+        await self._publisher.say_farewell()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.wait(self._tasks, timeout=END_S)
 
 
 class PlaceRecords:

@@ -1,21 +1,22 @@
-"""Words back to vehicles: what others see ahead of one, and what changed about its tile's field.
+"""Warnings to vehicles: objects that others see ahead of them, and new fields of their tile.
 
-Whoever took notices in Hello is told of every confirmed object (``rfcore.perception.objects``) that
+A vehicle that asks for notices in Hello gets one for every confirmed object
+(``rfcore.perception.objects``) that
 
 * stands within ``REACH_M`` ahead of it, in the same tile,
-* is seen by somebody else's camera, and was not seen by its own within the last second,
-* is not the vehicle itself: further than ``OWN_M`` from where its cameras are and were since,
+* is seen by another vehicle's camera, and was not seen by its own within the last second,
+* is not the vehicle itself: further than ``OWN_M`` from where its cameras are and were since.
 
-with a picture that shows it: when it is confirmed and again every ``REPEAT_S`` while that holds,
-the nearest first, at most ``MOST_PER_S`` notices a second. Where a vehicle is known from its
-pictures: one whose pictures have no pose is told nothing of objects. Ahead is where it drives, by
-the last ``LEAST_WAY_M`` of its way; for one that stands, where its camera ``front`` looks, or else
-the first camera of its Hello.
+The notice is sent with a picture that shows the object: when it is confirmed and again every
+``REPEAT_S`` while that holds, the nearest first, at most ``MOST_PER_S`` notices a second. The
+server knows a vehicle's position from its pictures: one whose pictures have no pose gets no
+notices of objects. Ahead is the direction of travel over the last ``LEAST_WAY_M``; for a standing
+vehicle it is where its camera ``front`` looks, or else the first camera of its Hello.
 
-Pictures are looked at only while a vehicle takes notices, by the thread that finds things
+Pictures are analysed only while a vehicle takes notices, by the thread that finds objects
 (``mec_server.twin.rendering``): it gives way to decoding, waits for no view, takes the newest
-picture first, and is charged like a consumer to ``NOTICES_IDENTITY``, so that the time it may take
-is bounded; what it cannot look at is missed, and delays nothing.
+picture first, and is charged like a consumer to ``NOTICES_IDENTITY``, so that its time is bounded.
+Pictures for which there is no time are missed, and delay nothing.
 """
 
 from __future__ import annotations
@@ -52,40 +53,41 @@ __all__ = [
 ]
 
 NOTICES_IDENTITY = "server: notices"
-"""Whom looking at pictures is charged to."""
+"""The identity that the analysis of pictures is charged to."""
 
 REACH_M = 100.0
 OWN_M = 3.5
-"""From a camera of the vehicle's own, 1.5 m above the road, to the foot of its own front, side or
+"""Distance from a vehicle's own camera, 1.5 m above the road, to the foot of its front, side or
 rear as others see it: 3.2 m on the ground."""
 LEAST_WAY_M, WAY_S = 1.0, 2.0
-"""Who drove less in so long stands."""
+"""A vehicle that moved less than this in this time counts as standing."""
 FRONT = "front"
 REPEAT_S = 0.5
 MOST_PER_S = 10
 VALID_S = 1.0
-"""Of an object: two repetitions may be lost. By then, who told of it has forgotten it as well."""
+"""Validity of an object's notice: two repetitions may be lost. The server has dropped the object by
+then, too."""
 FIELD_VALID_S = 600.0
 
 KNOWN_FOR_S = 2.0
-"""How old the picture may be that says where a vehicle is."""
+"""Greatest age of the picture that a vehicle's position is taken from."""
 LOOK_AGAIN_S = 1.0
-"""How soon it is noticed that nobody takes notices any more, where no pictures come."""
+"""Longest wait for a picture before checking whether any vehicle still takes notices."""
 
 
 Vec3 = tuple[float, float, float]
 
 
 class NoticeTaker(Protocol):
-    """A stream whose vehicle takes notices."""
+    """A stream of a vehicle that takes notices."""
 
     @property
     def session_id(self) -> str:
-        """Which stream it is."""
+        """The id of the stream."""
 
     @property
     def vehicle_id(self) -> str:
-        """Whose stream it is."""
+        """The vehicle of the stream."""
 
     @property
     def camera_ids(self) -> tuple[str, ...]:
@@ -96,12 +98,12 @@ class NoticeTaker(Protocol):
         """The fields that its vehicle codes against."""
 
     def tell(self, notice: StreetNotice) -> None:
-        """Pass a notice on."""
+        """Send a notice."""
 
 
 @dataclass(frozen=True)
 class OwnCamera:
-    """Where a camera of a vehicle was at the capture of its newest picture, and how it moves."""
+    """Position of a vehicle's camera at the capture of its newest picture, and its velocity."""
 
     captured_s: float
     at_m: Vec3
@@ -109,7 +111,7 @@ class OwnCamera:
 
     @staticmethod
     def of(views: Sequence[ReceivedPicture]) -> OwnCamera:
-        """Return that of one camera's pictures, all of a known pose, the oldest first."""
+        """Return it from one camera's pictures, all of known pose, the oldest first."""
         newest = views[-1]
         at_m, velocity_mps = _place_of(newest), (0.0, 0.0, 0.0)
         for view in reversed(views[:-1]):
@@ -123,13 +125,13 @@ class OwnCamera:
         return OwnCamera(newest.captured_s, at_m, velocity_mps)
 
     def at(self, time_s: float) -> Vec3:
-        """Return where it is at another time, if it goes on like this."""
+        """Return the position at another time, at constant velocity."""
         elapsed_s = time_s - self.captured_s
         x, y, z = (a + elapsed_s * v for a, v in zip(self.at_m, self.velocity_mps, strict=True))
         return x, y, z
 
     def passed_m(self, point_m: Vec3, from_s: float, to_s: float) -> float:
-        """Return how near it comes to a point between two times."""
+        """Return the least distance from a point between two times."""
         start_m, end_m = np.array(self.at(from_s)), np.array(self.at(to_s))
         way_m, length2 = end_m - start_m, float(((end_m - start_m) ** 2).sum())
         share = float((point_m - start_m) @ way_m) / length2 if length2 else 0.0
@@ -138,7 +140,7 @@ class OwnCamera:
 
 @dataclass(frozen=True)
 class VehiclePosition:
-    """Where a vehicle is: its cameras, the one of its newest picture first; and where ahead is."""
+    """A vehicle's cameras, the one of its newest picture first, and the direction ahead."""
 
     cameras: tuple[OwnCamera, ...]
     ahead: Vec3
@@ -147,8 +149,11 @@ class VehiclePosition:
     def of(
         cameras: Sequence[Sequence[ReceivedPicture]], camera_ids: Sequence[str]
     ) -> VehiclePosition:
-        """Return those of a vehicle by the pictures of its cameras, at least one of one, all of
-        known poses, the oldest first; ``camera_ids``: in the order of its Hello."""
+        """Return it from the pictures of a vehicle's cameras.
+
+        There is at least one camera; pictures have known poses and come oldest first.
+        ``camera_ids``: the cameras in the order of the vehicle's Hello.
+        """
         newest_first = sorted(cameras, key=lambda views: -views[-1].captured_s)
         own = tuple(OwnCamera.of(views) for views in newest_first)
         way = own[0].velocity_mps
@@ -162,8 +167,10 @@ class VehiclePosition:
         return VehiclePosition(own, (x, y, z))
 
     def distance_ahead_m(self, each: FollowedObject, now: float) -> float | None:
-        """Return how far an object is in front of the vehicle; ``None`` if it is behind it, out of
-        reach, or the vehicle itself."""
+        """Return the distance of an object in front of the vehicle.
+
+        None for one that is behind it or out of reach, and for the vehicle itself.
+        """
         at_m, eye_m = each.at(now), self.cameras[0].at(now)
         distance_m = math.dist(at_m, eye_m)
         along_m = sum((a - b) * c for a, b, c in zip(at_m, eye_m, self.ahead, strict=True))
@@ -191,21 +198,21 @@ class _SentNotice:
 
 
 class StreamNotices:
-    """What one vehicle is told of objects: which of them, when again, and by which number.
+    """Decides which notices one vehicle gets, when they are repeated, and numbers them.
 
     Without clock or sockets.
     """
 
     def __init__(self, vehicle_id: str) -> None:
         self._vehicle_id = vehicle_id
-        self._told: dict[tuple[str, int], _SentNotice] = {}
+        self._sent: dict[tuple[str, int], _SentNotice] = {}
         self._next_id = 1
         self._recent_s: deque[float] = deque(maxlen=MOST_PER_S)
 
     def about_objects(
         self, field_id: str, own: VehiclePosition, objects: Iterable[FollowedObject], now: float
     ) -> list[StreetNotice]:
-        """Return what the vehicle, which is at ``own``, is to be told now."""
+        """Return the notices of ``objects`` that the vehicle, at ``own``, gets now."""
         ahead = []
         for each in objects:
             seen_by = {vehicle_id for vehicle_id, _ in each.seen_by(now)}
@@ -217,9 +224,9 @@ class StreamNotices:
         for distance_m, each, vehicles in sorted(ahead, key=lambda it: (it[0], it[1].object_id)):
             if not self._may_tell(now):
                 break
-            told = self._told.get((field_id, each.object_id))
-            if told is None or (now - told.at_s >= REPEAT_S and each.last_s > told.seen_s):
-                notice_id = self._note((field_id, each.object_id), told, each.last_s, now)
+            sent = self._sent.get((field_id, each.object_id))
+            if sent is None or (now - sent.at_s >= REPEAT_S and each.last_s > sent.seen_s):
+                notice_id = self._note((field_id, each.object_id), sent, each.last_s, now)
                 subject = _object_ahead(field_id, each, distance_m, vehicles, now)
                 notices.append(StreetNotice(notice_id, VALID_S, subject))
         return notices
@@ -232,11 +239,11 @@ class StreamNotices:
         return len(self._recent_s) < MOST_PER_S or now - self._recent_s[0] >= 1.0
 
     def _note(
-        self, key: tuple[str, int], told: _SentNotice | None, seen_s: float, now: float
+        self, key: tuple[str, int], sent: _SentNotice | None, seen_s: float, now: float
     ) -> int:
         self._recent_s.append(now)
-        notice_id = self._new_id() if told is None else told.notice_id
-        self._told[key] = _SentNotice(notice_id, now, seen_s)
+        notice_id = self._new_id() if sent is None else sent.notice_id
+        self._sent[key] = _SentNotice(notice_id, now, seen_s)
         return notice_id
 
     def _new_id(self) -> int:
@@ -244,9 +251,9 @@ class StreamNotices:
         return self._next_id - 1
 
     def _forget(self, now: float) -> None:
-        """Give what was not told of for so long that it has expired a new number."""
-        for key in [key for key, told in self._told.items() if now - told.at_s > VALID_S]:
-            del self._told[key]
+        """Forget notices that have expired: a later one of the same object gets a new number."""
+        for key in [key for key, sent in self._sent.items() if now - sent.at_s > VALID_S]:
+            del self._sent[key]
 
 
 def _object_ahead(
@@ -268,7 +275,7 @@ def _object_ahead(
 
 
 def field_changes(before: Sequence[Tile], after: Sequence[Tile]) -> list[tuple[Tile, FieldChange]]:
-    """Return what ``after`` publishes for tiles of ``before`` that these did not have."""
+    """Return the fields that ``after`` adds to tiles of ``before``, with the old tile of each."""
     known = {tile.name: tile for tile in before}
     changes = []
     for tile in after:
@@ -288,7 +295,7 @@ def field_changes(before: Sequence[Tile], after: Sequence[Tile]) -> list[tuple[T
 
 
 class StreetNotices:
-    """Looks at the pictures of ``twin`` for the streams that ``takers`` returns, and tells them."""
+    """Finds objects in the pictures of ``twin`` and warns the streams that ``takers`` returns."""
 
     def __init__(
         self,
@@ -305,19 +312,18 @@ class StreetNotices:
         self._metrics = metrics
         self._streams: dict[str, StreamNotices] = {}
         self._trackers: dict[frozenset[str], ObjectTracker] = {}
-        self._is_looking = False
 
     async def follow(self) -> None:
-        """Look at pictures until nobody takes notices."""
+        """Analyse pictures until no vehicle takes notices."""
         if not self._takers():
             return
         arrived = asyncio.Event()
         every = Subscription(encoding=PictureEncoding.NONE)
         mailbox = self._twin.watch(every, arrived.set, counts_misses=False)
-        self._is_looking = True
+        self._twin.expect = self._expect
         for taker in self._takers():
             for field_id in taker.field_ids:
-                self._views.prepare(self._place_of(field_id), NOTICES_IDENTITY)
+                self._views.prepare(self._tile_of(field_id), NOTICES_IDENTITY)
         try:
             while self._takers():
                 entry = mailbox.take()
@@ -329,62 +335,63 @@ class StreetNotices:
                         async with asyncio.timeout(LOOK_AGAIN_S):
                             await arrived.wait()
         finally:
-            self._is_looking = False
+            self._twin.ignore_expected()
             self._twin.unwatch(mailbox)
             self._streams.clear()
             self._trackers.clear()
 
-    def expect(self, field_id: str, camera: Camera) -> None:
+    def _expect(self, field_id: str, camera: Camera) -> None:
         """Prepare for a picture of ``camera``, coded against a field, that is being decoded."""
-        if self._is_looking:
-            self._views.expect_picture(camera, self._place_of(field_id), NOTICES_IDENTITY)
+        self._views.expect_picture(camera, self._tile_of(field_id), NOTICES_IDENTITY)
 
-    def _place_of(self, field_id: str) -> ViewedTile:
+    def _tile_of(self, field_id: str) -> ViewedTile:
         return viewed_tile(ObjectsRequest(field_id=field_id), self._tiles())
 
     def fields_changed(self, before: Sequence[Tile], after: Sequence[Tile]) -> None:
-        """Tell the vehicles of a tile that it has a new field."""
+        """Notify the vehicles of a tile of its new field."""
         for tile, change in field_changes(before, after):
             for taker in self._takers():
                 if taker.field_ids & tile.archive_ids:
                     self._tell(taker, self._stream(taker).about_field(change))
 
-    async def _look_at(self, seen: ReceivedPicture) -> None:
-        """Find what a picture shows, and tell those whom it concerns."""
-        place = self._place_of(seen.field_id)
-        takers = [taker for taker in self._takers() if taker.field_ids & place.field_ids]
+    async def _look_at(self, picture: ReceivedPicture) -> None:
+        """Find the objects in a picture, and send notices to the vehicles that they concern."""
+        tile = self._tile_of(picture.field_id)
+        takers = [taker for taker in self._takers() if taker.field_ids & tile.field_ids]
         if not takers:
-            self._trackers.pop(place.field_ids, None)
+            self._trackers.pop(tile.field_ids, None)
             return
         try:
-            found = await self._views.objects_in(seen, place, NOTICES_IDENTITY)
+            found = await self._views.objects_in(picture, tile, NOTICES_IDENTITY)
         except LimitExceeded:
             return
-        tracker = self._trackers.setdefault(place.field_ids, ObjectTracker())
-        tracker.take(found.detections, seen.key, seen.captured_s, found.rules_out, found.labels)
+        tracker = self._trackers.setdefault(tile.field_ids, ObjectTracker())
+        tracker.take(
+            found.detections, picture.key, picture.captured_s, found.rules_out, found.labels
+        )
         now = time.monotonic()
         objects = [
             each
             for each in tracker.confirmed(now)
-            if each.last_s == seen.captured_s and not each.is_doubtful
+            if each.last_s == picture.captured_s and not each.is_doubtful
         ]
         self._forget_streams()
         for taker in takers:
-            self._tell_of(taker, place, objects, now)
+            self._tell_of(taker, tile, objects, now)
 
     def _tell_of(
-        self, taker: NoticeTaker, place: ViewedTile, objects: Sequence[FollowedObject], now: float
+        self, taker: NoticeTaker, tile: ViewedTile, objects: Sequence[FollowedObject], now: float
     ) -> None:
         cameras = [
             [view for view in views if view.frame.pose is not None]
             for views in self._twin.cameras_of(taker.session_id)
-            if views[-1].field_id in place.field_ids and views[-1].age_s(now) <= KNOWN_FOR_S
+            if views[-1].field_id in tile.field_ids and views[-1].age_s(now) <= KNOWN_FOR_S
             if views[-1].frame.pose is not None
         ]
         if not cameras:
             return
         stream, own = self._stream(taker), VehiclePosition.of(cameras, taker.camera_ids)
-        for notice in stream.about_objects(place.field_id, own, objects, now):
+        for notice in stream.about_objects(tile.field_id, own, objects, now):
             self._tell(taker, notice)
 
     def _tell(self, taker: NoticeTaker, notice: StreetNotice) -> None:

@@ -1,14 +1,13 @@
-"""Views of the twin for consumers: which pictures may enter them, where they are computed, and what
-that is charged.
+"""Views of the twin for consumers, and the objects in its pictures.
 
-Views are composed on one thread that works while a processor is idle, and the things in pictures
-are found, for notices and for whoever asks for objects, on another that gives way to decoding
-alone: what a vehicle is to be told does not wait for views. Each has fields of its own: neither
-event loop nor the workers that decode, nor the renderers these share, wait for them. Identities
-take turns, and pay with worker time, the same as vehicles.
+Views are composed on one thread that works while a processor is idle. Objects are found, for
+notices and for consumers, on another thread that gives way to decoding alone: warnings do not wait
+for views. Each thread has fields of its own, so that neither the event loop nor the workers that
+decode, nor the renderers these share, wait for it. Identities take turns and pay with worker time,
+as vehicles do.
 
-What a picture changes in a field is found once, by whichever thread comes first. The field's view
-of its pose is the decoder's own render, where that is still there and of the same field and size.
+A picture is compared with a field once, by whichever thread needs it first. The field's view at
+its pose is the decoder's own render, if that is kept and of the same field and size.
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded
 from rfcore.field import RadianceField
 from rfcore.field.quality import FULL
-from rfcore.image import Rgb, jpeg_bytes, png_bytes
-from rfcore.native.yuv import i420_from_rgb
+from rfcore.image import Rgb
 from rfcore.perception.composition import (
     ComposedView,
     LivePicture,
@@ -48,7 +46,7 @@ from rfcore.perception.objects import CameraKey, RulesOut, rules_nothing_out
 from rfcore.views import View
 from rfcore.wire.checks import check_label, shown
 from rfcore.wire.tiles import Tile
-from rfcore.wire.twin import PictureEncoding
+from rfcore.wire.twin import encoded_picture
 from rfcore.wire.twin_render import (
     NO_AGE,
     LiveCamera,
@@ -57,36 +55,38 @@ from rfcore.wire.twin_render import (
     ViewRequest,
 )
 
-__all__ = ["Classify", "PictureObjects", "ViewService", "ViewedTile", "check_inside", "viewed_tile"]
+__all__ = ["Classify", "PictureObjects", "ViewService", "ViewedTile", "viewed_tile"]
 
 R = TypeVar("R")
 OpenField = Callable[[str], RadianceField]
 
 Classify = Callable[[Rgb], str]
-"""A detector: returns what the thing in a cut-out of a picture, uint8 [H, W, 3], is called: a name
-of at most 64 letters, digits, '.', '_' or '-', or nothing."""
+"""A detector: returns the name of the object in a cut-out of a picture, uint8 [H, W, 3]: at most 64
+letters, digits, '.', '_' or '-', or nothing."""
 
-LOOKS_NICE = 5
-"""Of the thread that finds things, for objects and notices, which are worth nothing when they are
-late: at 10 it found nothing for seconds where others kept the processors busy."""
+FINDING_NICE = 5
+"""Niceness of the thread that finds objects, which are worth nothing when they are late: at 10 it
+found none for seconds where others kept the processors busy."""
 MOST_KEPT = 16
-"""Live pictures whose difference from the field is kept for the next view."""
+"""Pictures whose comparison with a field is kept for the next view."""
 
 MOST_AHEAD = 2
-"""Drawings that wait for pictures which are not there yet."""
+"""Tasks that may wait in preparation of pictures which are not there yet."""
 MOST_GROUNDS = 2
 """Fields whose ground is kept, and which are open for it."""
 
 BEYOND_BOUNDS_M = 5.0
-"""How far outside of a field's box a view may be."""
+"""Greatest distance of a viewpoint from the box of its field."""
 INSIDE_M, INSIDE_SHARE = 0.3, 0.9
-"""A view of which so much is nearer than this is inside of something."""
+"""A viewpoint is inside of something if this share of its view is nearer than this distance."""
 
 
 @dataclass(frozen=True)
 class ViewedTile:
-    """A field to draw, and every field that pictures of the same ground may be coded against.
-    ``world``: what poses and objects are relative to, None for the field's origin."""
+    """A field to draw, and all fields that pictures of the same ground may be coded against.
+
+    ``world``: the origin of poses and objects; None for the origin of the field.
+    """
 
     field_id: str
     field_ids: frozenset[str]
@@ -94,8 +94,10 @@ class ViewedTile:
 
 
 def viewed_tile(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) -> ViewedTile:
-    """Return what ``request`` names; raise ``InvalidInput`` for a tile that is not published, or a
-    place that is on none."""
+    """Return the tile that ``request`` names.
+
+    Raises ``InvalidInput`` for a tile that is not published, and for a place on no tile.
+    """
     if request.place is not None:
         tile = _tile_at(request.place, tiles)
         return ViewedTile(tile.field_id, tile.archive_ids, request.place)
@@ -133,9 +135,11 @@ def _area_of(tile: Tile) -> str:
 
 @dataclass(frozen=True, eq=False)
 class PictureObjects:
-    """What a picture says of things that the field does not have: those it shows, and of which it
-    says that they are not there. ``origin_m``: of the field, relative to the place's ``world``;
-    ``labels``: what a detector calls each of them, none without one."""
+    """Objects seen in a picture that the field lacks, and a test for ones that it rules out.
+
+    ``origin_m``: the field's origin, relative to ``ViewedTile.world``; ``labels``: a detector's
+    name for each object, empty without a detector.
+    """
 
     detections: list[Detection]
     rules_out: RulesOut = rules_nothing_out
@@ -145,15 +149,15 @@ class PictureObjects:
 
 @dataclass(frozen=True, eq=False)
 class _AnalysedPicture:
-    """A picture, what it changes in a field, and the things in it."""
+    """A picture, its difference from a field, and the objects in it."""
 
-    seen: ReceivedPicture
+    picture: ReceivedPicture
     live: LivePicture
     detections: list[Detection]
 
 
 class _FieldThread:
-    """One thread, and the fields that it alone renders, which ``open_field`` opens."""
+    """One thread, and the fields that it alone renders; ``open_field`` opens them."""
 
     def __init__(self, worker: Workers, open_field: OpenField) -> None:
         self.worker = worker
@@ -161,7 +165,7 @@ class _FieldThread:
         self._grounds: OrderedDict[str, FieldGround] = OrderedDict()
 
     def ground(self, field: RadianceField) -> FieldGround:
-        """Return the ground of ``field``; what of it was drawn is kept."""
+        """Return the ground of ``field``; what was drawn of it is kept."""
         ground = self._grounds.pop(field.field_id, None) or FieldGround(field.render)
         self._grounds[field.field_id] = ground
         if len(self._grounds) > MOST_GROUNDS:
@@ -170,36 +174,36 @@ class _FieldThread:
 
 
 class _AnalysisCache:
-    """What the newest pictures change in fields, for all threads."""
+    """Keeps the analyses of the newest pictures, for all threads."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[CameraKey, str], _AnalysedPicture] = OrderedDict()
         self._lock = Lock()
 
-    def of(self, seen: ReceivedPicture, field_id: str) -> _AnalysedPicture | None:
-        """Return what was kept of ``seen``, None if nothing was."""
+    def of(self, picture: ReceivedPicture, field_id: str) -> _AnalysedPicture | None:
+        """Return the analysis of ``picture``, None if it is not kept."""
         with self._lock:
-            kept = self._kept.get((seen.key, field_id))
-            if kept is None or kept.seen is not seen:
+            kept = self._kept.get((picture.key, field_id))
+            if kept is None or kept.picture is not picture:
                 return None
-            self._kept.move_to_end((seen.key, field_id))
+            self._kept.move_to_end((picture.key, field_id))
         return kept
 
-    def keep(self, looked_at: _AnalysedPicture, field_id: str) -> None:
-        """Keep what was found, in place of what its camera showed before."""
+    def keep(self, analysed: _AnalysedPicture, field_id: str) -> None:
+        """Keep an analysis, in place of that of its camera's picture before."""
         with self._lock:
-            self._kept[looked_at.seen.key, field_id] = looked_at
-            self._kept.move_to_end((looked_at.seen.key, field_id))
+            self._kept[analysed.picture.key, field_id] = analysed
+            self._kept.move_to_end((analysed.picture.key, field_id))
             if len(self._kept) > MOST_KEPT:
                 self._kept.popitem(last=False)
 
 
 class ViewService:
-    """Composes views of ``twin``, and finds the things in its pictures.
+    """Composes views of ``twin``, and finds the objects in its pictures.
 
-    ``open_fields`` returns, for each thread, what opens fields that only this thread uses;
-    ``tiles`` are those published now. ``failed`` is called with what a callback of a thread raised.
-    ``classify`` names the things of pictures, on the thread that finds them.
+    ``open_fields`` returns, for each thread, a function that opens fields for it alone; ``tiles``
+    returns the published tiles. ``failed`` is called with an exception of a thread's callback.
+    ``classify`` names the objects in pictures, on the thread that finds them.
     """
 
     def __init__(
@@ -216,16 +220,16 @@ class ViewService:
         self._tiles = tiles
         self._ledger = ledger
         views = Workers(1, failed, "views", begin=work_when_idle)
-        looks = Workers(1, failed, "looks", begin=partial(give_way, LOOKS_NICE))
+        objects = Workers(1, failed, "objects", begin=partial(give_way, FINDING_NICE))
         self._composing = _FieldThread(views, open_fields())
-        self._looking = _FieldThread(looks, open_fields())
-        self._kept = _AnalysisCache()
+        self._finding = _FieldThread(objects, open_fields())
+        self._analyses = _AnalysisCache()
         self._ahead = 0
 
     def close(self) -> None:
         """Stop the threads."""
         self._composing.worker.close()
-        self._looking.worker.close()
+        self._finding.worker.close()
 
     def spend_message(self, identity: str) -> None:
         """Charge a message of a stream; raise ``LimitExceeded``."""
@@ -245,7 +249,7 @@ class ViewService:
         viewpoint outside of the field or inside of a wall, or a moment of which the pictures are
         not there. A caller that is cancelled costs at most the view that has begun.
         """
-        place = self.place(request, may_draw)
+        tile = self.tile(request, may_draw)
         now = time.monotonic()
         ago_s = _ago_s(request, time.time_ns(), self._twin.reach_s(now))
         if request.time_ns:
@@ -253,37 +257,38 @@ class ViewService:
         else:
             known = self._twin.recent(now, request.max_age_s)
         pictures = [
-            seen
-            for seen in known
-            if seen.field_id in place.field_ids and covers(seen.vehicle_id, seen.field_id)
+            each
+            for each in known
+            if each.field_id in tile.field_ids and covers(each.vehicle_id, each.field_id)
         ]
-        work = partial(self._composed, request, place, pictures, now - ago_s)
+        work = partial(self._composed, request, tile, pictures, now - ago_s)
         return await self._on_thread(self._composing, identity, work)
 
     async def objects_in(
-        self, seen: ReceivedPicture, place: ViewedTile, identity: str
+        self, picture: ReceivedPicture, tile: ViewedTile, identity: str
     ) -> PictureObjects:
-        """Return what a picture shows that the field of ``place`` does not have; nothing for one
-        without a pose.
+        """Return the objects in a picture that the field of ``tile`` lacks; none without a pose.
 
         Raises ``LimitExceeded`` while ``identity`` has spent its worker time.
         """
-        if seen.frame.pose is None:
+        if picture.frame.pose is None:
             return PictureObjects([])
-        compute = partial(self._detected, seen, place)
-        return await self._on_thread(self._looking, identity, compute)
+        compute = partial(self._detected, picture, tile)
+        return await self._on_thread(self._finding, identity, compute)
 
-    def prepare(self, place: ViewedTile, identity: str) -> None:
-        """Open the field of ``place`` and draw it once, so that the first glance is not late."""
-        self._look_ahead(partial(self._warmed_up, place), identity)
+    def prepare(self, tile: ViewedTile, identity: str) -> None:
+        """Open the field of ``tile`` and draw it once, so that the first objects are not late."""
+        self._prepare_for(partial(self._warmed_up, tile), identity)
 
-    def expect_picture(self, camera: Camera, place: ViewedTile, identity: str) -> None:
-        """Draw what a glance at a picture of ``camera`` will need of the field's ground, while the
-        picture is being decoded: a place that was not looked at takes as long as that."""
-        self._look_ahead(partial(self._ground_ahead, camera, place), identity)
+    def expect_picture(self, camera: Camera, tile: ViewedTile, identity: str) -> None:
+        """Draw the ground that a picture of ``camera`` will be compared with, while it is decoded.
 
-    def _look_ahead(self, draw: Callable[[], object], identity: str) -> None:
-        """Draw, unless ``MOST_AHEAD`` wait or ``identity`` has spent its worker time."""
+        Ground that was not drawn before takes as long as the decoding.
+        """
+        self._prepare_for(partial(self._ground_ahead, camera, tile), identity)
+
+    def _prepare_for(self, draw: Callable[[], object], identity: str) -> None:
+        """Draw, unless ``MOST_AHEAD`` tasks wait or ``identity`` has spent its worker time."""
         if self._ahead >= MOST_AHEAD:
             return
         try:
@@ -292,22 +297,22 @@ class ViewService:
             return
         self._ahead += 1
         work = partial(_seconds_of, draw)
-        self._looking.worker.submit(identity, work, partial(self._looked_ahead, identity))
+        self._finding.worker.submit(identity, work, partial(self._prepared, identity))
 
-    def _looked_ahead(self, identity: str, outcome: float | Exception) -> None:
+    def _prepared(self, identity: str, outcome: float | Exception) -> None:
         self._ahead -= 1
         if isinstance(outcome, Exception):
             raise outcome
         self._ledger.charge(identity, Resource.WORKER_SECONDS, outcome, time.monotonic())
 
-    def place(
+    def tile(
         self, request: ViewRequest | ObjectsRequest, may_draw: Callable[[str], bool]
     ) -> ViewedTile:
-        """Return where to look; raise ``InvalidInput`` or ``AccessDenied``."""
-        place = viewed_tile(request, self._tiles())
-        if not may_draw(place.field_id):
+        """Return the tile of a request; raise ``InvalidInput`` or ``AccessDenied``."""
+        tile = viewed_tile(request, self._tiles())
+        if not may_draw(tile.field_id):
             raise AccessDenied("this certificate may not see that tile; ask the operator")
-        return place
+        return tile
 
     async def _on_thread(self, thread: _FieldThread, identity: str, compute: Callable[[], R]) -> R:
         self._ledger.check(identity, Resource.WORKER_SECONDS, time.monotonic())
@@ -338,7 +343,7 @@ class ViewService:
     def _timed(
         self, compute: Callable[[], R], answer: asyncio.Future[R]
     ) -> tuple[float, R | Exception]:
-        """Return for how long the thread was busy, and the result, or why there is none."""
+        """Return how long the thread was busy, and the result or the error."""
         if answer.cancelled():
             return 0.0, asyncio.InvalidStateError("nobody waits for this")
         started = time.monotonic()
@@ -351,82 +356,82 @@ class ViewService:
     def _composed(
         self,
         request: ViewRequest,
-        place: ViewedTile,
+        tile: ViewedTile,
         pictures: list[ReceivedPicture],
         moment_s: float,
     ) -> RenderedView:
         """Return the view at ``moment_s`` (monotonic), or at the time of composing it if the
         request is for now."""
-        field = self._composing.open_field(place.field_id)
-        camera = _in_tile(request.camera, place, field)
-        check_inside(camera, field)
+        field = self._composing.open_field(tile.field_id)
+        camera = _in_tile(request.camera, tile, field)
+        _check_inside(camera, field)
         view = field.render(camera, request.quality)
-        check_outside_of_walls(view)
+        _check_outside_of_walls(view)
         by_key = sorted(pictures, key=lambda it: it.key)
-        seen = nearest(by_key, camera, lambda it: it.frame.pose, lambda it: it.vehicle_id)
+        chosen = nearest(by_key, camera, lambda it: it.frame.pose, lambda it: it.vehicle_id)
         now = time.monotonic()
         past = request.time_ns != 0
-        ages_s = [moment_s - it.captured_s if past else it.age_s(now) for it in seen]
-        pairs = zip(seen, ages_s, strict=True)
-        live = [(self._looked_at(each, field, self._composing).live, age) for each, age in pairs]
-        vehicles = [each.vehicle_id for each in seen]
+        ages_s = [moment_s - it.captured_s if past else it.age_s(now) for it in chosen]
+        pairs = zip(chosen, ages_s, strict=True)
+        live = [(self._analysed(each, field, self._composing).live, age) for each, age in pairs]
+        vehicles = [each.vehicle_id for each in chosen]
         composed = compose(camera, view, live, request.max_age_s, vehicles)
         cameras = tuple(
             LiveCamera(each.vehicle_id, each.frame.camera_id, age_s, share, picture.trust == 0)
-            for each, (picture, age_s), share in zip(seen, live, composed.shares, strict=True)
+            for each, (picture, age_s), share in zip(chosen, live, composed.shares, strict=True)
         )
         return RenderedView(
             number=request.number,
             time_ns=request.time_ns or time.time_ns(),
-            field_id=place.field_id,
+            field_id=tile.field_id,
             encoding=request.encoding,
-            picture=_encoded(composed.rgb, request.encoding),
+            picture=encoded_picture(composed.rgb, request.encoding),
             depth=composed.depth,
             age_ms=_milliseconds(composed),
             cameras=cameras,
         )
 
-    def _detected(self, seen: ReceivedPicture, place: ViewedTile) -> PictureObjects:
-        field = self._looking.open_field(place.field_id)
-        looked = self._looked_at(seen, field, self._looking)
-        labels = () if self._classify is None else _labels(self._classify, looked)
+    def _detected(self, picture: ReceivedPicture, tile: ViewedTile) -> PictureObjects:
+        field = self._finding.open_field(tile.field_id)
+        found = self._analysed(picture, field, self._finding)
+        labels = () if self._classify is None else _labels(self._classify, found)
         return PictureObjects(
-            looked.detections, looked.live.rules_out, _origin_m(place, field), labels
+            found.detections, found.live.rules_out, _origin_m(tile, field), labels
         )
 
-    def _warmed_up(self, place: ViewedTile) -> None:
-        field = self._looking.open_field(place.field_id)
+    def _warmed_up(self, tile: ViewedTile) -> None:
+        field = self._finding.open_field(tile.field_id)
         x_m, y_m, z_m = (sum(ends) / 2 for ends in zip(*astuple(field.bounds), strict=True))
-        self._looking.ground(field).warm_up((x_m, y_m, z_m))
+        self._finding.ground(field).warm_up((x_m, y_m, z_m))
 
-    def _ground_ahead(self, camera: Camera, place: ViewedTile) -> None:
-        field = self._looking.open_field(place.field_id)
-        self._looking.ground(field).ahead_of(camera)
+    def _ground_ahead(self, camera: Camera, tile: ViewedTile) -> None:
+        field = self._finding.open_field(tile.field_id)
+        self._finding.ground(field).ahead_of(camera)
 
-    def _looked_at(
-        self, seen: ReceivedPicture, field: RadianceField, thread: _FieldThread
+    def _analysed(
+        self, picture: ReceivedPicture, field: RadianceField, thread: _FieldThread
     ) -> _AnalysedPicture:
-        """Return what a picture changes in ``field``, which is one of ``thread``."""
-        kept = self._kept.of(seen, field.field_id)
+        """Return the comparison of a picture with ``field``, which is one of ``thread``."""
+        kept = self._analyses.of(picture, field.field_id)
         if kept is None:
-            kept = self._look_at(seen, field, thread.ground(field))
-            self._kept.keep(kept, field.field_id)
+            kept = self._analyse(picture, field, thread.ground(field))
+            self._analyses.keep(kept, field.field_id)
         return kept
 
-    def _look_at(
-        self, seen: ReceivedPicture, field: RadianceField, ground: FieldGround
+    def _analyse(
+        self, picture: ReceivedPicture, field: RadianceField, ground: FieldGround
     ) -> _AnalysedPicture:
-        assert seen.frame.pose is not None
-        rgb, intrinsics = shrunk(seen.picture, seen.intrinsics)
-        camera = Camera(intrinsics, seen.frame.pose)
-        live = live_picture(camera, rgb, self._field_view(seen, camera, field))
-        return _AnalysedPicture(seen, *cut_out(live, ground))
+        assert picture.frame.pose is not None
+        rgb, intrinsics = shrunk(picture.picture, picture.intrinsics)
+        camera = Camera(intrinsics, picture.frame.pose)
+        live = live_picture(camera, rgb, self._field_view(picture, camera, field))
+        return _AnalysedPicture(picture, *cut_out(live, ground))
 
-    def _field_view(self, seen: ReceivedPicture, camera: Camera, field: RadianceField) -> View:
-        """Return what ``field`` shows at the ``camera`` of a picture: the decoder's render if that
-        is of this field and size."""
-        render = self._twin.renders.of(seen)
-        same = seen.field_id == field.field_id and camera.intrinsics == seen.intrinsics
+    def _field_view(self, picture: ReceivedPicture, camera: Camera, field: RadianceField) -> View:
+        """Return the view of ``field`` at a picture's ``camera``: the decoder's render if that is
+        of this field and size."""
+        render = self._twin.renders.of(picture)
+        same = picture.field_id == field.field_id and camera.intrinsics == picture.intrinsics
         return field.render(camera, FULL) if render is None or not same else render
 
 
@@ -436,11 +441,11 @@ def _seconds_of(work: Callable[[], object]) -> float:
     return time.monotonic() - started
 
 
-def _labels(classify: Classify, looked: _AnalysedPicture) -> tuple[str, ...]:
-    """Return what ``classify`` calls each thing of a picture, by the box of its outline."""
-    rgb, _ = shrunk(looked.seen.picture, looked.seen.intrinsics)
+def _labels(classify: Classify, analysed: _AnalysedPicture) -> tuple[str, ...]:
+    """Return the name that ``classify`` gives each object of a picture, by its bounding box."""
+    rgb, _ = shrunk(analysed.picture.picture, analysed.picture.intrinsics)
     labels = []
-    for thing in looked.live.things:
+    for thing in analysed.live.things:
         patch = thing.patch
         height, width = patch.samples.shape[:2]
         box = rgb[patch.top : patch.top + height, patch.left : patch.left + width]
@@ -449,8 +454,10 @@ def _labels(classify: Classify, looked: _AnalysedPicture) -> tuple[str, ...]:
 
 
 def _ago_s(request: ViewRequest, now_ns: int, reach_s: float) -> float:
-    """Return how long ago the moment is that a request is for; raise ``InvalidInput`` for one that
-    has not come, or longer ago than ``reach_s``."""
+    """Return how long ago the moment of a request is.
+
+    Raises ``InvalidInput`` for one in the future, or longer ago than ``reach_s``.
+    """
     ago_s = (now_ns - request.time_ns) / 1e9 if request.time_ns else 0.0
     if not 0 <= ago_s <= reach_s:
         when = f"{ago_s:.3f} s ago" if ago_s > 0 else f"{-ago_s:.3f} s ahead"
@@ -462,11 +469,11 @@ def _ago_s(request: ViewRequest, now_ns: int, reach_s: float) -> float:
     return ago_s
 
 
-def _origin_m(place: ViewedTile, field: RadianceField) -> tuple[float, float, float]:
-    """Return where the field's origin is, relative to what ``place`` says poses are."""
-    if place.world is None:
+def _origin_m(tile: ViewedTile, field: RadianceField) -> tuple[float, float, float]:
+    """Return the field's origin, relative to the origin of poses in ``tile``."""
+    if tile.world is None:
         return (0.0, 0.0, 0.0)
-    origin, world = field.metadata.tile_origin, place.world
+    origin, world = field.metadata.tile_origin, tile.world
     return (
         origin.east_m - world.east_m,
         origin.north_m - world.north_m,
@@ -474,13 +481,13 @@ def _origin_m(place: ViewedTile, field: RadianceField) -> tuple[float, float, fl
     )
 
 
-def _in_tile(camera: Camera, place: ViewedTile, field: RadianceField) -> Camera:
-    """Return a camera that is relative to ``place`` relative to the field's origin."""
-    shift = TileOrigin(*_origin_m(place, field))
+def _in_tile(camera: Camera, tile: ViewedTile, field: RadianceField) -> Camera:
+    """Return a camera given relative to the world of ``tile`` relative to the field's origin."""
+    shift = TileOrigin(*_origin_m(tile, field))
     return replace(camera, world_from_cam=shift.localise(camera.world_from_cam))
 
 
-def check_inside(camera: Camera, field: RadianceField) -> None:
+def _check_inside(camera: Camera, field: RadianceField) -> None:
     """Raise ``InvalidInput`` for a camera further than ``BEYOND_BOUNDS_M`` outside of the field."""
     low_m, high_m = field.bounds.low_m, field.bounds.high_m
     for axis, at_m, low, high in zip(
@@ -494,7 +501,7 @@ def check_inside(camera: Camera, field: RadianceField) -> None:
             )
 
 
-def check_outside_of_walls(view: View) -> None:
+def _check_outside_of_walls(view: View) -> None:
     """Raise ``InvalidInput`` for a view that something fills at arm's length."""
     near = (view.opacity > 0.5) & (view.depth < INSIDE_M)
     share = float(near.mean())
@@ -504,18 +511,6 @@ def check_outside_of_walls(view: View) -> None:
             f"{share:.0%} of the view is nearer than {INSIDE_M:g} m: the viewpoint is inside of "
             "something; move it into the open",
         )
-
-
-def _encoded(rgb: Rgb, encoding: PictureEncoding) -> bytes:
-    match encoding:
-        case PictureEncoding.NONE:
-            return b""
-        case PictureEncoding.I420:
-            return i420_from_rgb(rgb).packed()
-        case PictureEncoding.JPEG:
-            return jpeg_bytes(rgb)
-        case PictureEncoding.PNG:
-            return png_bytes(rgb)
 
 
 def _milliseconds(composed: ComposedView) -> np.ndarray[tuple[int, ...], np.dtype[np.uint16]]:

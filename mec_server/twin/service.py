@@ -1,7 +1,7 @@
 """TwinService over grpc.aio: one coroutine per consumer, between its mailbox and its stream.
 
-Pictures are encoded on one thread of their own, each once for however many consumers, so that
-consumers take no time from the workers that decode.
+One thread encodes pictures, each once for all consumers, so that consumers take no time from the
+workers that decode.
 """
 
 from __future__ import annotations
@@ -24,14 +24,13 @@ from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
 from mec_server.twin.rendering import ViewedTile, ViewService
 from mec_server.twin.state import Covers, Mailbox, ReceivedPicture, Twin
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
-from rfcore.image import I420, jpeg_bytes, png_bytes
-from rfcore.native.yuv import rgb_from_i420
 from rfcore.perception.objects import ObjectReports, StreetObject
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
     Subscription,
     TwinPicture,
+    encoded_picture,
     subscription_from_wire,
     twin_message_to_wire,
 )
@@ -51,13 +50,15 @@ __all__ = [
     "PictureEncoder",
     "RenderCalls",
     "TwinService",
-    "encoded",
     "picture_message",
 ]
 
 
+Encodings = dict[PictureEncoding, asyncio.Future[bytes]]
+
+
 class PictureEncoder:
-    """Encodes views; an encoded picture is kept as long as its view."""
+    """Encodes pictures; the encoded bytes are kept as long as the picture."""
 
     def __init__(self) -> None:
         self._executor = ThreadPoolExecutor(1, "twin")
@@ -65,30 +66,19 @@ class PictureEncoder:
             ReceivedPicture, dict[PictureEncoding, asyncio.Future[bytes]]
         ] = WeakKeyDictionary()
 
-    async def bytes_of(self, view: ReceivedPicture, encoding: PictureEncoding) -> bytes:
-        """Return the picture of ``view``."""
-        done = self._done.setdefault(view, {})
+    async def bytes_of(self, picture: ReceivedPicture, encoding: PictureEncoding) -> bytes:
+        """Return the encoded picture."""
+        done = self._done.setdefault(picture, {})
         if encoding not in done:
             loop = asyncio.get_running_loop()
-            done[encoding] = loop.run_in_executor(self._executor, encoded, view.picture, encoding)
+            done[encoding] = loop.run_in_executor(
+                self._executor, encoded_picture, picture.picture, encoding
+            )
         return await asyncio.shield(done[encoding])
 
     def close(self) -> None:
         """Stop the thread."""
         self._executor.shutdown(cancel_futures=True)
-
-
-def encoded(picture: I420, encoding: PictureEncoding) -> bytes:
-    """Return ``picture`` as bytes: see ``PictureEncoding`` in twin.proto."""
-    match encoding:
-        case PictureEncoding.NONE:
-            return b""
-        case PictureEncoding.I420:
-            return picture.packed()
-        case PictureEncoding.JPEG:
-            return jpeg_bytes(rgb_from_i420(picture))
-        case PictureEncoding.PNG:
-            return png_bytes(rgb_from_i420(picture))
 
 
 Context = grpc.aio.ServicerContext[pb.WatchRequest, pb.WatchResponse]
@@ -97,9 +87,11 @@ AnyContext = grpc.aio.ServicerContext[Any, Any]
 
 @dataclass(frozen=True)
 class ConsumerAccess:
-    """What one consumer may see: ``covers`` says it of a picture, ``may_draw`` of a field's id, and
-    ``check_vehicles`` raises ``AccessDenied`` for vehicles asked for by name that it can never
-    see."""
+    """The pictures and fields that one consumer may see.
+
+    ``covers`` decides for a picture, ``may_draw`` for a field's id; ``check_vehicles`` raises
+    ``AccessDenied`` for vehicles asked for by name that the consumer can never see.
+    """
 
     covers: Covers
     check_vehicles: Callable[[frozenset[str]], None]
@@ -107,12 +99,12 @@ class ConsumerAccess:
 
 
 class TwinService(twin_pb2_grpc.TwinServiceServicer):
-    """Streams the pictures of ``twin`` to consumers.
+    """Streams the pictures of ``twin`` to consumers, and views that ``views`` composes.
 
-    ``slots`` says how many may watch; one that took nothing for ``limits.stalled_s`` is too slow,
-    and one that asks for views and asked for none in ``limits.idle_s`` is let go. ``failed`` is
-    called with an unexpected exception, which ends the stream that met it. ``sight``
-    says what the peer of a call may see, ``views`` composes views for it.
+    ``slots`` limits the number of consumers. One that took nothing for ``limits.stalled_s`` is
+    disconnected, as is one that asks for views and asked for none in ``limits.idle_s``. ``failed``
+    is called with an unexpected exception, which ends its stream. ``access`` returns what the peer
+    of a call may see.
     """
 
     def __init__(
@@ -122,11 +114,11 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         slots: Slots,
         limits: SessionLimits,
         failed: Callable[[Exception], None],
-        sight: Callable[[Context], ConsumerAccess],
+        access: Callable[[Context], ConsumerAccess],
         views: ViewService,
     ) -> None:
         self._twin = twin
-        self._sight = sight
+        self._access = access
         self._metrics = metrics
         self._slots = slots
         self._stalled_s = limits.stalled_s
@@ -134,7 +126,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         self._pictures = PictureEncoder()
         self._draining = asyncio.Event()
         self._views = views
-        self._renders = RenderCalls(views, metrics, slots, limits, failed, sight, self._draining)
+        self._renders = RenderCalls(views, metrics, slots, limits, failed, access, self._draining)
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
@@ -142,7 +134,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
 
     @property
     def pictures(self) -> PictureEncoder:
-        """What encodes pictures, each once for whoever wants it."""
+        """The encoder, which encodes each picture once for all its users."""
         return self._pictures
 
     def drain(self) -> None:
@@ -150,7 +142,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         self._draining.set()
 
     def close(self) -> None:
-        """Stop encoding; ``views`` are their owner's."""
+        """Stop encoding."""
         self._pictures.close()
 
     async def Render(  # noqa: N802
@@ -171,8 +163,8 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         """Send pictures until the consumer leaves, reads too slowly, or the server drains."""
         try:
             subscription = subscription_from_wire(request)
-            sight = self._sight(context)
-            sight.check_vehicles(subscription.vehicle_ids)
+            access = self._access(context)
+            access.check_vehicles(subscription.vehicle_ids)
         except (InvalidInput, AccessDenied) as error:
             await abort(context, error)
         try:
@@ -182,23 +174,23 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
             await abort(context, error)
         consumer = _PictureWriter(self._twin, self._pictures, self._metrics, context)
         with held:
-            await self._watch(subscription, sight.covers, context, consumer)
+            await self._watch(subscription, access.covers, context, consumer)
 
     async def Objects(  # type: ignore[override]  # noqa: N802
         self, request: pb.ObjectsRequest, context: AnyContext
     ) -> None:
-        """Send the objects of a place with each picture, until the consumer leaves."""
+        """Send the objects of a tile with each picture, until the consumer leaves."""
         try:
-            sight = self._sight(context)
-            place = self._views.place(objects_request_from_wire(request), sight.may_draw)
+            access = self._access(context)
+            tile = self._views.tile(objects_request_from_wire(request), access.may_draw)
             held = self._slots.hold(context)
         except RfedgeError as error:
             await abort(context, error)
 
         def covers(vehicle_id: str, field_id: str) -> bool:
-            return field_id in place.field_ids and sight.covers(vehicle_id, field_id)
+            return field_id in tile.field_ids and access.covers(vehicle_id, field_id)
 
-        consumer = _ObjectsWriter(self._twin, self._views, self._metrics, context, place)
+        consumer = _ObjectsWriter(self._twin, self._views, self._metrics, context, tile)
         with held:
             await self._watch(Subscription(), covers, context, consumer)
 
@@ -229,7 +221,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
 
 
 class _MailboxWriter(ABC):
-    """Writes what arrives in one mailbox. ``unread``: what a slow consumer has not taken."""
+    """Writes the entries of one mailbox; ``unread``: what a slow consumer did not take."""
 
     def __init__(self, twin: Twin, context: AnyContext) -> None:
         self._twin = twin
@@ -244,7 +236,7 @@ class _MailboxWriter(ABC):
         stalled_s: float,
         draining: asyncio.Event,
     ) -> ConsumerEnd:
-        """Write what arrives, to the end; return how it ended."""
+        """Write entries until the stream is over; return the reason."""
         mailbox = self._twin.watch(subscription, self._arrived.set, covers)
         drained = asyncio.create_task(draining.wait())
         try:
@@ -275,12 +267,12 @@ class _MailboxWriter(ABC):
             self._twin.unwatch(mailbox)
 
     def _next(self, mailbox: Mailbox) -> Coroutine[None, None, None] | None:
-        """Return what is to be written now, None for nothing."""
+        """Return the writing of the next message, None if there is none."""
         entry = mailbox.take()
         return None if entry is None else self._write(mailbox, entry)
 
     def _rest_s(self) -> float | None:
-        """How long to wait for an entry; None: until there is one."""
+        """Return how long to wait for an entry; None for no limit."""
         return None
 
     async def _rest(self, drained: asyncio.Task[bool]) -> None:
@@ -293,11 +285,11 @@ class _MailboxWriter(ABC):
 
     @abstractmethod
     async def _write(self, mailbox: Mailbox, entry: ReceivedPicture | Departure) -> None:
-        """Write what the consumer is to have of one entry."""
+        """Write the message for one entry."""
 
 
 class _PictureWriter(_MailboxWriter):
-    """Writes the pictures themselves."""
+    """Writes pictures."""
 
     def __init__(
         self, twin: Twin, pictures: PictureEncoder, metrics: TwinMetrics, context: Context
@@ -322,7 +314,7 @@ class _PictureWriter(_MailboxWriter):
 
 
 class _ObjectsWriter(_MailboxWriter):
-    """Writes what the pictures show that the field does not have, as of now."""
+    """Writes the objects in the pictures that the field lacks, at their present positions."""
 
     def __init__(
         self,
@@ -330,80 +322,82 @@ class _ObjectsWriter(_MailboxWriter):
         views: ViewService,
         metrics: TwinMetrics,
         context: AnyContext,
-        place: ViewedTile,
+        tile: ViewedTile,
     ) -> None:
         super().__init__(twin, context)
         self._views = views
         self._metrics = metrics
-        self._place = place
-        self._told = ObjectReports()
+        self._tile = tile
+        self._reports = ObjectReports()
         self._origin_m = (0.0, 0.0, 0.0)
         self._identity, _ = peer_account(context)
 
     def _next(self, mailbox: Mailbox) -> Coroutine[None, None, None] | None:
-        """Return the next entry's work, or that of telling again what is due."""
-        if time.monotonic() >= self._told.again_s:
-            return self._tell()
+        """Return the writing of the next entry, or of a report that is due again."""
+        if time.monotonic() >= self._reports.again_s:
+            return self._report()
         return super()._next(mailbox)
 
     def _rest_s(self) -> float | None:
-        again_s = self._told.again_s
+        again_s = self._reports.again_s
         return max(0.0, again_s - time.monotonic()) if math.isfinite(again_s) else None
 
     async def _write(self, mailbox: Mailbox, entry: ReceivedPicture | Departure) -> None:
         if isinstance(entry, ReceivedPicture):
             try:
-                found = await self._views.objects_in(entry, self._place, self._identity)
-            except LimitExceeded:  # out of worker time: it is missed, as by a slow consumer
+                found = await self._views.objects_in(entry, self._tile, self._identity)
+            except LimitExceeded:  # out of worker time: the picture is missed
                 mailbox.skipped[entry.key] += 1
                 return
             self._origin_m, seen_s = found.origin_m, entry.captured_s
             taken = (found.detections, entry.key, seen_s, found.rules_out, found.labels)
-            self._told.tracker.take(*taken)
-        await self._tell()
+            self._reports.tracker.take(*taken)
+        await self._report()
 
-    async def _tell(self) -> None:
-        objects = tuple(self._from_place(each) for each in self._told.now(time.monotonic()))
-        message = objects_to_wire(ObjectsSeen(time.time_ns(), self._place.field_id, objects))
+    async def _report(self) -> None:
+        objects = tuple(self._in_world(each) for each in self._reports.now(time.monotonic()))
+        message = objects_to_wire(ObjectsSeen(time.time_ns(), self._tile.field_id, objects))
         await self._context.write(message)
         self._metrics.bytes.inc(message.ByteSize())
 
-    def _from_place(self, each: StreetObject) -> StreetObject:
+    def _in_world(self, each: StreetObject) -> StreetObject:
         x_m, y_m, z_m = (at + shift for at, shift in zip(each.at_m, self._origin_m, strict=True))
         return replace(each, at_m=(x_m, y_m, z_m))
 
 
 def picture_message(
-    view: ReceivedPicture, age_s: float, encoding: PictureEncoding, data: bytes, skipped: int
+    picture: ReceivedPicture, age_s: float, encoding: PictureEncoding, data: bytes, skipped: int
 ) -> TwinPicture:
-    """Return what a consumer is sent of ``view``: its picture as ``data``, in ``encoding``."""
-    packet = view.frame.packet
+    """Return the message for a consumer: the picture as ``data``, in ``encoding``."""
+    packet = picture.frame.packet
     return TwinPicture(
-        vehicle_id=view.vehicle_id,
-        camera_id=view.frame.camera_id,
-        session_id=view.session_id,
+        vehicle_id=picture.vehicle_id,
+        camera_id=picture.frame.camera_id,
+        session_id=picture.session_id,
         epoch=packet.epoch,
         sequence=packet.sequence,
-        capture_time_ns=view.frame.capture_time_ns,
+        capture_time_ns=picture.frame.capture_time_ns,
         age_ns=round(age_s * 1e9),
-        pose=view.frame.pose,
-        intrinsics=view.intrinsics,
-        field_id=view.field_id,
-        reconstruction_digest=view.digest,
+        pose=picture.frame.pose,
+        intrinsics=picture.intrinsics,
+        field_id=picture.field_id,
+        reconstruction_digest=picture.digest,
         encoding=encoding,
         picture=data,
         skipped=skipped,
         payload_bytes=len(packet.payload),
         references=packet.references,
-        clock=view.frame.clock,
-        localisation=view.frame.localisation,
-        instant=view.frame.instant,
+        clock=picture.frame.clock,
+        localisation=picture.frame.localisation,
+        instant=picture.frame.instant,
     )
 
 
 class RenderCalls:
-    """Answers calls with views. The arguments are those of ``TwinService``; every call, and every
-    stream for as long as it lasts, holds one of ``slots``."""
+    """Answers the calls of ``TwinService``, whose arguments it takes, for views.
+
+    Each call holds one of ``slots`` for as long as it lasts.
+    """
 
     def __init__(
         self,
@@ -412,7 +406,7 @@ class RenderCalls:
         slots: Slots,
         limits: SessionLimits,
         failed: Callable[[Exception], None],
-        sight: Callable[[AnyContext], ConsumerAccess],
+        access: Callable[[AnyContext], ConsumerAccess],
         draining: asyncio.Event,
     ) -> None:
         self._views = views
@@ -420,11 +414,11 @@ class RenderCalls:
         self._slots = slots
         self._stalled_s, self._idle_s = limits.stalled_s, limits.idle_s
         self._failed = failed
-        self._sight = sight
+        self._access = access
         self._draining = draining
 
     async def render(self, request: pb.RenderRequest, context: AnyContext) -> pb.RenderResponse:
-        """Return one view, or end the call with the status of what is wrong."""
+        """Return one view, or end the call with the status of the error."""
         with await self._hold(context):
             return rendered_view_to_wire(await self._view(request, context))
 
@@ -468,10 +462,10 @@ class RenderCalls:
 
     async def _view(self, request: pb.RenderRequest, context: AnyContext) -> RenderedView:
         try:
-            sight = self._sight(context)
+            access = self._access(context)
             asked = view_request_from_wire(request)
             identity, _ = peer_account(context)
-            return await self._views.view(asked, identity, sight.covers, sight.may_draw)
+            return await self._views.view(asked, identity, access.covers, access.may_draw)
         except RfedgeError as error:
             await abort(context, error)
         except Exception as error:
@@ -504,11 +498,11 @@ class RenderCalls:
 
 
 class _ViewRequests:
-    """Reads the requests of one stream, of which it keeps the newest.
+    """Reads the requests of one stream and keeps the newest.
 
     ``spend`` is called for each and may raise ``LimitExceeded``, which ends the reading. ``error``:
-    what ended it, None for the peer. ``is_idle``: no request came for too long. ``skipped``:
-    requests that got no answer. ``unread``: an answer that the peer does not take.
+    the error that ended it, if there was one. ``is_idle``: no request came for too long.
+    ``skipped``: requests without an answer. ``unread``: an answer that the peer does not take.
     """
 
     def __init__(
@@ -529,8 +523,10 @@ class _ViewRequests:
         self._reading.cancel()
 
     async def next(self, drained: asyncio.Task[bool], within_s: float) -> pb.RenderRequest | None:
-        """Return the newest request once there is one, None when there will be none, or none came
-        ``within_s``."""
+        """Wait for a request and return the newest.
+
+        Return None when there will be none, or none came ``within_s``.
+        """
         while self._newest is None and not self._reading.done() and not drained.done():
             arrived = asyncio.create_task(self._arrived.wait())
             done, _ = await asyncio.wait(

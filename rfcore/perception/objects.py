@@ -279,8 +279,11 @@ class ObjectTracker:
         rules_out: RulesOut = rules_nothing_out,
         labels: Sequence[str] = (),
     ) -> None:
-        """Take in what one picture of ``camera``, captured at ``time_s``, shows, of which things it
-        says that they are not there (``rules_out``), and what a detector calls each that it shows."""
+        """Take in one picture of ``camera``, captured at ``time_s``.
+
+        ``detections``: the objects that it shows; ``rules_out``: tests whether it should show an
+        object and does not; ``labels``: a detector's name for each detection, if there is one.
+        """
         self._objects = [each for each in self._objects if time_s - each.last_s <= FORGOTTEN_S]
         pairs = sorted(
             (distance_m, each.object_id, index)

@@ -14,9 +14,9 @@ from typing import Final, cast
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec.references import Reference, References
 from rfcore.errors import InvalidInput, ProtocolError
-from rfcore.image import I420, Rgb, rgb_from_bytes
+from rfcore.image import I420, Rgb, jpeg_bytes, png_bytes, rgb_from_bytes
 from rfcore.localise.estimate import LocalisationState
-from rfcore.native.yuv import rgb_from_i420
+from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.perception.objects import CameraKey
 from rfcore.wire.checks import check_name, check_range
 from rfcore.wire.sensing import (
@@ -35,6 +35,7 @@ __all__ = [
     "Subscription",
     "TwinPicture",
     "decoded_picture",
+    "encoded_picture",
     "encoding_from_wire",
     "encoding_to_wire",
     "intrinsics_to_wire",
@@ -51,7 +52,7 @@ MAX_WATCHED_VEHICLES: Final = 256
 
 
 class PictureEncoding(StrEnum):
-    """How a picture travels: see twin.proto."""
+    """The encoding of a picture on the wire: see twin.proto."""
 
     NONE = "none"
     I420 = "i420"
@@ -117,6 +118,17 @@ class TwinPicture:
     def rgb(self) -> Rgb:
         """The picture as uint8 [H, W, 3]; raises ``DatasetError`` for one that did not travel."""
         return decoded_picture(self.encoding, _size_px(self.intrinsics), self.picture)
+
+
+def encoded_picture(picture: I420 | Rgb, encoding: PictureEncoding) -> bytes:
+    """Return a picture, planes or uint8 [H, W, 3], as bytes: see ``PictureEncoding``."""
+    if encoding is PictureEncoding.NONE:
+        return b""
+    if encoding is PictureEncoding.I420:
+        planes = picture if isinstance(picture, I420) else i420_from_rgb(picture)
+        return planes.packed()
+    rgb = rgb_from_i420(picture) if isinstance(picture, I420) else picture
+    return jpeg_bytes(rgb) if encoding is PictureEncoding.JPEG else png_bytes(rgb)
 
 
 def decoded_picture(encoding: PictureEncoding, size_px: tuple[int, int], data: bytes) -> Rgb:

@@ -98,8 +98,7 @@ class Decode:
     def run(self) -> None:
         """Decode every frame; stop at the first packet that fails a check."""
         from mec_server.config import DecoderKind
-        from mec_server.decoding.decoders import Decoders, DecoderSettings
-        from mec_server.ledger.peer_log import LogLimiter
+        from mec_server.decoding.decoders import Decoders
         from rfcore.image import write_png
         from rfcore.native.yuv import rgb_from_i420
         from rfcore.raster.renderers import renderer_isa
@@ -112,12 +111,7 @@ class Decode:
         field = open_field(self.field, threads=self.threads, isa=isa)
         self.out.mkdir(parents=True, exist_ok=True)
         # A decoder of root becomes another user, and nothing but it runs on what the file says.
-        settings = DecoderSettings(DecoderKind(self.decoder), as_root=True)
-        decoders = Decoders(settings, lambda _: None, lambda _: None, LogLimiter())
-        decoders.start()
-        try:
+        with Decoders(DecoderKind(self.decoder), as_root=True) as decoders:
             for decoded in decode_drive(drive, field, decoders.open):
                 write_png(self.out / f"{decoded.sequence:06d}.png", rgb_from_i420(decoded.frame))
-        finally:
-            decoders.close()
         print(f"{self.out}: {len(drive.frames)} frames")

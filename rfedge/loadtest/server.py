@@ -26,7 +26,7 @@ from mec_server.reconstruction import (
     Tools,
     open_cameras,
 )
-from mec_server.session import DecodeJob, DecodeOutcome, OpenJob
+from mec_server.session import DecodeJob, OpenJob
 from rfcore.camera import Camera
 from rfcore.field import Quality, Renderer
 from rfcore.image import I420
@@ -52,8 +52,8 @@ class PassingDecoder:
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         """Return grey; the session has checked the packet's CRC before there was a job."""
-        outcome = DecodeOutcome(job.frame.packet.reconstruction_digest, StageTimes())
-        return Reconstruction(self._grey, outcome)
+        digest = job.frame.packet.reconstruction_digest
+        return Reconstruction(self._grey, digest, StageTimes())
 
     def close(self) -> None:
         """Nothing is held."""

@@ -112,7 +112,7 @@ def decoders(pid: int) -> set[int]:
 
 
 def was_given(pid: int, slice_: bytes) -> bool:
-    """Whether a decoder process was given a slice to decode (``mec_server.decoding.protocol``)."""
+    """Whether a decoder process was given a slice to decode (``mec_server.decoding.child``)."""
     return any(slice_ in memory for memory in _shared_memory(pid))
 
 

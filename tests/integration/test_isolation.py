@@ -13,7 +13,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from mec_server.config import AdmissionLimits, DecoderKind, LearnSettings, NatsSettings
-from mec_server.connections import Connections, Cut
+from mec_server.connections import ClosedConnections, Connections
 from mec_server.metrics import BackgroundTask
 from mec_server.peers import FAILED
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
@@ -222,8 +222,9 @@ async def test_a_stream_that_ends_halfway_through_its_opening_opens_no_more_deco
         return H264Decoder(size_px)
 
     async with serve(admission=EVERYBODY) as server:
-        tools = replace(server._edge._server.tools, open_decoder=open_decoder)
-        server._edge._server = replace(server._edge._server, tools=tools)
+        decoding = server._edge._server.decoding
+        decoding = replace(decoding, tools=replace(decoding.tools, open_decoder=open_decoder))
+        server._edge._server = replace(server._edge._server, decoding=decoding)
         async with raw_vehicle(server.address) as vehicle:
             await vehicle.say(with_cameras(coded.hello, "cav-gone", ["a", "b", "c"]))
             assert await asyncio.to_thread(first.wait, 30)
@@ -315,7 +316,7 @@ async def fields_fail(scene: Scene) -> Any:
 async def connections_fail(scene: Scene) -> Any:
     sweep, looked = "mec_server.connections.Connections.sweep", threading.Event()
 
-    def seen(_: Connections, now: float) -> list[Cut]:
+    def seen(_: Connections, now: float) -> list[ClosedConnections]:
         del now
         looked.set()
         return []
@@ -354,7 +355,7 @@ async def stream_fails(scene: Scene) -> Any:
 
 
 async def consumer_fails(scene: Scene) -> Any:
-    scene.patch.setattr("mec_server.twin.service.encoded", surprise)
+    scene.patch.setattr("mec_server.twin.service.encoded_picture", surprise)
     async with scene.serve() as server, AsyncExitStack() as stack:
         channel = grpc.aio.insecure_channel(str(server.address))
         stub = twin_pb2_grpc.TwinServiceStub(await stack.enter_async_context(channel))
@@ -412,7 +413,7 @@ async def recording_fails(scene: Scene) -> Any:
 
 async def learning_fails(scene: Scene) -> Any:
     scene.patch.setattr("mec_server.server.LEARNING_EVERY_S", 0.001)
-    scene.patch.setattr("mec_server.server.Learner.look", surprise)
+    scene.patch.setattr("mec_server.server.Learning.look", surprise)
     learn = LearnSettings(on=True)
     async with scene.serve(record=scene.folder, learn=learn) as server:
         await until(lambda: failed(server, BackgroundTask.LEARNING))
@@ -464,7 +465,7 @@ async def nats_fields_fail(scene: Scene) -> Any:
 
 async def _nats_fails(scene: Scene, part: str, task: BackgroundTask) -> Any:
     """Have a part fail at first; nobody listens at the port, so that the other one waits."""
-    scene.patch.setattr("mec_server.server.NATS_AGAIN_S", 0.001)
+    scene.patch.setattr("mec_server.twin.nats.AGAIN_S", 0.001)
     scene.patch.setattr(f"{part}.run", surprise)
     nats = NatsSettings("nats://127.0.0.1:1")
     async with scene.serve(nats=nats) as server:

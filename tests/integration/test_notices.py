@@ -123,7 +123,7 @@ async def test_the_ground_of_a_picture_is_drawn_before_the_picture_is_there(
         async with raw_vehicle(server.address) as taker:
             await taker.greet(as_vehicle(coded.hello, "taker", takes=True))
             async with asyncio.timeout(20):
-                while not server._notices._is_looking:
+                while server._twin.expect != server._notices._expect:
                     await asyncio.sleep(0.001)
                 await vehicle.say(undecodable(bare_frame(street, coded.hello, there)))
                 assert isinstance(await vehicle.hear(), Nack)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from cav_agent.session import AgentSession
-from mec_server.session import DecodeJob, DecodeOutcome, OpenJob, ServerSession
+from mec_server.session import DecodeJob, OpenJob, ServerSession
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
@@ -123,8 +123,7 @@ class World:
         packet = job.frame.packet
         assert (packet.epoch, packet.sequence) > self.decoded, "handed out in order"
         self.decoded = (packet.epoch, packet.sequence)
-        outcome = DecodeOutcome(packet.reconstruction_digest, StageTimes())
-        self.server.decoded(job, outcome, self.now)
+        self.server.decoded(job, packet.reconstruction_digest, StageTimes(), self.now)
 
 
 @settings(max_examples=300)

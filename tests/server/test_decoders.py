@@ -13,13 +13,10 @@ from prometheus_client import CollectorRegistry
 
 from mec_server.config import DecoderKind, ServerConfig
 from mec_server.decoding import decoders as decoder_kinds
-from mec_server.decoding import pool as decoder_pool
 from mec_server.decoding import process
 from mec_server.decoding.child import LIMITS
-from mec_server.decoding.decoders import Decoders, DecoderSettings, decoder_program
-from mec_server.decoding.pool import ChildDecoder, DecoderPool
+from mec_server.decoding.decoders import ChildDecoder, DecoderPool, Decoders, decoder_program
 from mec_server.decoding.process import DecoderLost, DecoderProcess, ForkServer, LossCause
-from mec_server.ledger.peer_log import LogLimiter
 from mec_server.metrics import ServerMetrics
 from mec_server.server import EdgeServer
 from rfcore.codec.h264.ffmpeg import EncoderOptions, H264Decoder, PictureKind, encode_pictures
@@ -115,7 +112,7 @@ def test_what_does_not_fit_into_the_memory_is_handed_over_before(
     decoder: ChildDecoder, units: Sequence[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = H264Decoder(SIZE_PX)
-    monkeypatch.setattr(decoder_pool, "INPUT_BYTES", max(map(len, units)) + 1)
+    monkeypatch.setattr(decoder_kinds, "INPUT_BYTES", max(map(len, units)) + 1)
     for unit in units[:3]:
         decoder.feed(unit)
         here.feed(unit)
@@ -160,7 +157,7 @@ def test_nothing_is_forked_where_a_decoder_was_lost_since_it_was_looked_at(
         return DecoderProcess(forks)
 
     with monkeypatch.context() as late:
-        late.setattr(decoder_pool, "DecoderProcess", forked_too_late)
+        late.setattr(decoder_kinds, "DecoderProcess", forked_too_late)
         taken = [pool.take(), pool.take()]
     try:
         assert all(one.is_alive for one in taken)
@@ -242,9 +239,7 @@ def decoders() -> Callable[..., Decoders]:
     """Make decoders; tests may run as root."""
 
     def make(kind: DecoderKind, reachable: bool = True, as_root: bool = True) -> Decoders:
-        return Decoders(
-            DecoderSettings(kind, reachable, as_root), lambda _: None, unexpected, LogLimiter()
-        )
+        return Decoders(kind, reachable=reachable, as_root=as_root, start_failed=unexpected)
 
     return make
 
@@ -329,7 +324,7 @@ def test_a_spare_that_cannot_be_started_is_reported_though_nobody_waits_for_it()
 def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
     registry = CollectorRegistry()
     count_loss = ServerMetrics(registry).count_lost_decoder
-    made = Decoders(DecoderSettings(DecoderKind.CHILD), count_loss, unexpected, LogLimiter())
+    made = Decoders(DecoderKind.CHILD, count_loss=count_loss, start_failed=unexpected)
     made.start()
     decoder: Any = made.open(SIZE_PX)
     os.kill(process_of(decoder), signal.SIGSEGV)

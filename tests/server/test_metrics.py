@@ -15,6 +15,7 @@ from mec_server.decoding.process import LossCause
 from mec_server.ledger.budgets import Limit, Resource
 from mec_server.metrics import STAGES, BackgroundTask, OpeningResult, ServerMetrics
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
+from mec_server.twin.state import Twin
 from rfcore.codec.h264.config import REFERENCE_FRAMES
 from rfcore.codec.references import Reference, references_name
 from rfcore.errors import RejectReason
@@ -127,7 +128,7 @@ OWN = {"field", "tile", "version", "renderer_contract", "python", "device", "dri
 def both(registry: CollectorRegistry) -> ServerMetrics:
     """Return the server's metrics, with the twin's on the same registry."""
     metrics = ServerMetrics(registry)
-    TwinMetrics(metrics.instruments, dict, int)
+    TwinMetrics(metrics.instruments, Twin())
     return metrics
 
 

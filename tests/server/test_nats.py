@@ -40,7 +40,7 @@ async def test_while_nats_is_away_one_picture_a_camera_waits_and_the_others_are_
     make_frame: Callable[..., Frame],
 ) -> None:
     registry, twin, pictures = CollectorRegistry(), Twin(), PictureEncoder()
-    metrics = TwinMetrics(ServerMetrics(registry).instruments, dict, int)
+    metrics = TwinMetrics(ServerMetrics(registry).instruments, Twin())
     TwinPublisher(NatsLink(NOWHERE, "test"), "east", twin, pictures, tuple, metrics)
     for sequence in range(100):
         for vehicle in ("cav-1", "cav-2"):

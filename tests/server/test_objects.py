@@ -199,10 +199,10 @@ def test_a_thing_is_doubtful_while_nobody_sees_it_whose_picture_fits_the_field()
     for step in range(4):
         tracker.take([replace(at(1.0), trust=0.6)], FRONT, 0.1 * step)
     (thing,) = tracker.confirmed(0.3)
-    assert thing.told(0.3).is_doubtful
+    assert thing.report(0.3).is_doubtful
     tracker.take([replace(at(1.0), trust=0.9)], ("cav-2", "front"), 0.4)
     (thing,) = tracker.confirmed(0.4)
-    assert not thing.told(0.4).is_doubtful
+    assert not thing.report(0.4).is_doubtful
 
 
 def test_two_vehicles_that_see_one_thing_see_one_thing() -> None:
@@ -387,4 +387,4 @@ def test_a_thing_is_called_what_a_detector_calls_it_most_often() -> None:
     for step, name in enumerate(names):
         tracker.take([at(-4.0), at(4.0)], FRONT, 0.1 * step, labels=["", name])
     unknown, car_ = tracker.confirmed(0.4)
-    assert (unknown.told(0.4).label, car_.told(0.4).label) == ("", "car")
+    assert (unknown.report(0.4).label, car_.report(0.4).label) == ("", "car")

@@ -9,7 +9,6 @@ from mec_server.config import SessionLimits
 from mec_server.session import (
     MAX_UNUSABLE,
     DecodeJob,
-    DecodeOutcome,
     OpenJob,
     ServerSession,
     SessionState,
@@ -58,17 +57,20 @@ class ReferenceDecoder:
             for job in jobs:
                 assert isinstance(job, DecodeJob)
                 try:
-                    session.decoded(job, self.decode(job.frame), now)
+                    self.decode(job.frame)
+                    session.decoded(job, DIGEST, StageTimes(render_ns=5), now)
                 except PacketRejected as error:
                     session.rejected(job, error, now)
 
-    def decode(self, frame: Frame) -> DecodeOutcome:
+    def decode(self, frame: Frame) -> None:
         packet = frame.packet
         position = self.position.get(frame.camera_id, (0, -1))
         assert (packet.epoch, packet.sequence) > position, "the session hands them out in order"
         assert packet.crc32 == packet.expected_crc32(), "a damaged packet is rendered for"
         self.position[frame.camera_id] = (packet.epoch, packet.sequence)
-        return DecodeOutcome(b"d" * 16, StageTimes(render_ns=5))
+
+
+DIGEST = b"d" * 16
 
 
 def with_wrong_crc(frame: Frame) -> Frame:
@@ -378,7 +380,7 @@ def test_one_frame_of_a_camera_is_in_work_at_a_time_and_cameras_do_not_wait_for_
         FrameAddress("rear", 0, 0),
     ]
     assert session.jobs_to_start(1.0) == []
-    session.decoded(jobs[1], DecodeOutcome(b"d" * 16, StageTimes()), 1.5)
+    session.decoded(jobs[1], DIGEST, StageTimes(), 1.5)
     (after,) = session.jobs_to_start(1.5)
     assert isinstance(after, DecodeJob)
     assert after.frame.address == FrameAddress("rear", 0, 1)
@@ -388,7 +390,7 @@ def test_an_ack_says_where_the_time_went(session: ServerSession, make_frame: Mak
     session.receive(make_frame(0), 1.0)
     (job,) = session.jobs_to_start(1.25)
     assert isinstance(job, DecodeJob)
-    session.decoded(job, DecodeOutcome(b"d" * 16, StageTimes(render_ns=7, decode_ns=9)), 2.0)
+    session.decoded(job, DIGEST, StageTimes(render_ns=7, decode_ns=9), 2.0)
     ack = session.messages_to_send(2.0)[0]
     assert isinstance(ack, Ack)
     assert ack.times == StageTimes(250_000_000, 7, 0, 9, 1_000_000_000)
@@ -415,7 +417,7 @@ def test_an_idle_stream_is_closed_but_not_while_a_frame_is_in_work(
     assert isinstance(job, DecodeJob)
     session.handle_timer(110.0)
     assert session.closed is None
-    session.decoded(job, DecodeOutcome(b"d" * 16, StageTimes()), 111.0)
+    session.decoded(job, DIGEST, StageTimes(), 111.0)
     session.handle_timer(171.0)
     assert session.closed is not None
     assert session.closed.error is None, "it has broken no rule"

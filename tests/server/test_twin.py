@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -163,9 +164,8 @@ def test_what_was_shown_is_taken_or_missed_and_never_both(steps: list[tuple[str,
         if is_take:
             got += mailbox.take() is not None
         else:
-            frame = object.__new__(Frame)
-            entry = ReceivedPicture(name, "s", frame, INTRINSICS, "", PICTURE, b"", 0.0, 0.0)
-            mailbox.put((name, "front"), entry)
+            frame = Mock(Frame, camera_id="front")
+            mailbox.put(ReceivedPicture(name, "s", frame, INTRINSICS, "", PICTURE, b"", 0.0, 0.0))
             shown += 1
         assert len(mailbox) <= 2
     assert shown == got + sum(mailbox.skipped.values()) + len(mailbox)
