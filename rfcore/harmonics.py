@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["CONSTANT", "higher_harmonics"]
+__all__ = ["SH_DC", "higher_harmonics"]
 
-CONSTANT = 0.28209479177387814
-"""The harmonic of degree 0."""
+SH_DC = 0.28209479177387814
+"""The constant harmonic of degree 0, sqrt(1 / (4 pi)): colour = 0.5 + SH_DC * coefficient."""
 
 
 def higher_harmonics(x: Any, y: Any, z: Any) -> list[Any]:

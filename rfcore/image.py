@@ -50,6 +50,8 @@ HD_LINES = 720
 
 JPEG_QUANTISER = "3"
 """FFmpeg's scale for MJPEG: 2 is best, 31 worst."""
+GREY = 128
+"""The middle level, which is grey in all three planes."""
 
 
 def rgb_from_colour(colour: NDArray[np.float32]) -> Rgb:
@@ -69,8 +71,7 @@ class I420:
     v: Plane
 
     def __post_init__(self) -> None:
-        height, width = self.y.shape
-        half = ((height + 1) // 2, (width + 1) // 2)
+        half = _half(self.y.shape)
         if self.u.shape != half or self.v.shape != half:
             raise InvalidInput(
                 "i420", f"chroma planes {self.u.shape}, {self.v.shape} of luma {self.y.shape}"
@@ -91,16 +92,27 @@ class I420:
     @staticmethod
     def empty(size_px: tuple[int, int]) -> I420:
         """Return a picture of (width, height) whose samples are still to be written."""
-        width, height = size_px
-        half = ((height + 1) // 2, (width + 1) // 2)
-        return I420(*(np.empty(shape, np.uint8) for shape in ((height, width), half, half)))
+        shape = size_px[::-1]
+        return I420(*(np.empty(s, np.uint8) for s in (shape, _half(shape), _half(shape))))
+
+    @staticmethod
+    def filled(size_px: tuple[int, int], level: int = GREY) -> I420:
+        """Return a picture of (width, height) with every sample at ``level``."""
+        picture = I420.empty(size_px)
+        for plane in picture.planes:
+            plane.fill(level)
+        return picture
 
     def cropped(self, size_px: tuple[int, int]) -> I420:
         """Return the upper left part of (width, height), which shares this picture's samples."""
         width, height = size_px
-        half_height, half_width = (height + 1) // 2, (width + 1) // 2
-        half = (slice(half_height), slice(half_width))
+        half = tuple(map(slice, _half((height, width))))
         return I420(self.y[:height, :width], self.u[half], self.v[half])
+
+    def dense_planes(self) -> tuple[Plane, Plane, Plane]:
+        """Return the planes in contiguous memory, as kernels take them."""
+        y, u, v = map(np.ascontiguousarray, self.planes)
+        return y, u, v
 
     def packed(self) -> bytes:
         """Return the planes one after the other, each row by row without padding."""
@@ -113,7 +125,7 @@ class I420:
         Raises ``InvalidInput`` for another number of bytes.
         """
         width, height = size_px
-        half = ((height + 1) // 2, (width + 1) // 2)
+        half = _half((height, width))
         luma, chroma = width * height, half[0] * half[1]
         if len(data) != luma + 2 * chroma:
             raise InvalidInput(
@@ -125,13 +137,19 @@ class I420:
     def digest(self) -> bytes:
         """Return BLAKE2b-128 of the size and the three planes: equal pictures, equal 16 bytes."""
         state = hashlib.blake2b(self.digest_head(), digest_size=16)
-        for plane in self.planes:
-            state.update(np.ascontiguousarray(plane).data)
+        for plane in self.dense_planes():
+            state.update(plane.data)
         return state.digest()
 
     def digest_head(self) -> bytes:
         """Return what goes before the planes in the digest: the size."""
         return f"{self.size_px}".encode()
+
+
+def _half(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the shape of the chroma planes of luma [H, W]."""
+    height, width = shape
+    return (height + 1) // 2, (width + 1) // 2
 
 
 MAX_PICTURE_PX = 1 << 26

@@ -55,7 +55,6 @@ below 0.001 / 0.25 / 0.5 / 0.75 / 0.9 / above is 0.082 / 0.065 / 0.062 / 0.061 /
 """
 NOTHING_M = np.float32(1e-6)
 """A depth of nothing hit, or one whose inverse would overflow; no renderer draws so near."""
-GREY = 128
 F32 = NDArray[np.float32]
 
 
@@ -135,10 +134,9 @@ class FieldView:
     def nothing(intrinsics: Intrinsics) -> FieldView:
         """Return what a camera that is lost is given: grey, no depth, opaque nowhere."""
         shape = (intrinsics.height_px, intrinsics.width_px)
-        half = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
-        grey = (np.full(side, GREY, np.uint8) for side in (shape, half, half))
         nowhere = np.zeros(shape, np.float32)
-        return FieldView(Camera(intrinsics, Pose.identity()), I420(*grey), nowhere, nowhere)
+        grey = I420.filled(shape[::-1])
+        return FieldView(Camera(intrinsics, Pose.identity()), grey, nowhere, nowhere)
 
     @property
     def held_depth(self) -> HeldPlane | None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
 
 __all__ = ["STREET_GAUSSIANS", "STREET_SEED", "street_camera", "street_gaussians"]
@@ -21,7 +22,6 @@ __all__ = ["STREET_GAUSSIANS", "STREET_SEED", "street_camera", "street_gaussians
 STREET_GAUSSIANS = 200_000
 STREET_SEED = 1
 FIELD_OF_VIEW_DEG = 70.0
-SH_DC = 0.28209479177387814
 SHARES = {"facades": 0.38, "road": 0.2, "sky": 0.08, "trees": 0.2}
 """Of all Gaussians; cars get the rest."""
 

@@ -29,7 +29,7 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field.integers import Integers
 from rfcore.field.splat_grid import Steps, colour_numbers, colours_of
-from rfcore.harmonics import CONSTANT, higher_harmonics
+from rfcore.harmonics import SH_DC, higher_harmonics
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.trainable import TrainableRasterizer
 
@@ -188,7 +188,7 @@ def _harmonics(means: F32, camera: Camera) -> F32:
     x, y, z = (means - np.asarray(camera.world_from_cam.translation_m)).T
     length = np.maximum(np.sqrt(x * x + y * y + z * z), np.finfo(np.float64).tiny)
     higher = higher_harmonics(x / length, y / length, z / length)
-    return np.stack([np.full(len(means), CONSTANT), *higher], axis=1).astype(np.float32)
+    return np.stack([np.full(len(means), SH_DC), *higher], axis=1).astype(np.float32)
 
 
 def _weights(
@@ -203,7 +203,7 @@ def _weights(
         red_of_all = np.zeros_like(rasterizer.forward(camera).colour)
         red_of_all[..., 0] = 1
         rasterizer.backward(red_of_all)
-        yield camera, rasterizer.gradients()["sh"][:, 0, 0].astype(np.float64) / CONSTANT
+        yield camera, rasterizer.gradients()["sh"][:, 0, 0].astype(np.float64) / SH_DC
 
 
 def visible_area(gaussians: Gaussians) -> F64:

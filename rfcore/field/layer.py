@@ -38,13 +38,13 @@ from rfcore.field.interface import (
     stored_metadata,
 )
 from rfcore.field.splats import SplatField
+from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
 
 __all__ = [
     "MIDDLE_LUMA",
     "OFFSET_STEP",
     "OWN_STEP",
-    "SH_DC",
     "SLOPE_STEP",
     "VOXELS_M",
     "ColourLayer",
@@ -59,7 +59,6 @@ __all__ = [
 ENCODING = "voxels-1"
 VOXELS_M = (0.25, 1.0, 4.0, 16.0)
 """Sides of the voxels, powers of two so that dividing by them is exact."""
-SH_DC = 0.28209479177387814
 OFFSET_STEP = np.array([2.0, 4.0, 4.0]) / 255
 SLOPE_STEP = np.array([1.0, 2.0, 2.0]) / 32
 OWN_STEP = np.array([8.0, 16.0, 16.0]) / 255

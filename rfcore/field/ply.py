@@ -37,7 +37,7 @@ from rfcore.field.ply_table import (
     write_vertices,
 )
 from rfcore.field.splat_archive import check_decoded_size
-from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.gaussians import Gaussians, empty_arrays
 
 __all__ = ["antialiased_of", "read_open_ply", "write_ply"]
 
@@ -71,16 +71,10 @@ def read_open_ply(
             f"{path}: has filter_3D of Mip-Splatting; fuse it with its create_fused_ply.py first"
         )
     rest, origin = _rest_names(path, header), tile_origin or TileOrigin()
-    count, coefficients = header.count, 1 + len(rest) // 3
+    sh_degree = math.isqrt(1 + len(rest) // 3) - 1
     try:
-        check_decoded_size(count, math.isqrt(coefficients) - 1, max_bytes)
-        arrays = {
-            "means": np.empty((count, 3), np.float32),
-            "quaternions": np.empty((count, 4), np.float32),
-            "log_scales": np.empty((count, 3), np.float32),
-            "opacity_logits": np.empty(count, np.float32),
-            "sh": np.empty((count, coefficients, 3), np.float32),
-        }
+        check_decoded_size(header.count, sh_degree, max_bytes)
+        arrays = empty_arrays(header.count, sh_degree)
         for start, rows in read_rows(path, file, header):
             part = slice(start, start + len(rows))
             arrays["means"][part] = _means(rows, origin)

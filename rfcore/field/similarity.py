@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Pose, TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput
-from rfcore.harmonics import CONSTANT, higher_harmonics
+from rfcore.harmonics import SH_DC, higher_harmonics
 from rfcore.raster.gaussians import F32, Gaussians
 
 __all__ = ["Similarity", "moved", "read_field_from_world", "spherical_harmonics"]
@@ -89,7 +89,7 @@ def spherical_harmonics(directions: F64) -> F64:
     Same order and signs as ``rfcore.raster.reference`` (Kerbl et al. 2023; Sloan 2013).
     """
     x, y, z = directions.T
-    basis = [CONSTANT * np.ones_like(x), *higher_harmonics(x, y, z)]
+    basis = [SH_DC * np.ones_like(x), *higher_harmonics(x, y, z)]
     return np.stack(basis, axis=1)
 
 

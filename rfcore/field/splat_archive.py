@@ -52,7 +52,7 @@ from rfcore.field.splat_grid import (
     placed,
 )
 from rfcore.files import DECODED_BYTES
-from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, sky_of
+from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, empty_arrays, sky_of
 
 __all__ = [
     "ENCODING",
@@ -292,15 +292,7 @@ class _Stored:
         return {field: self._opened(name) for field, name in band.names.items()}
 
     def _gaussians(self, numbers: Sequence[tuple[_Band, Mapping[str, Columns]]]) -> Gaussians:
-        count, coefficients = numbers[-1][0].part.stop, (self.sh_degree + 1) ** 2
-        shapes = {
-            "means": (count, 3),
-            "quaternions": (count, 4),
-            "log_scales": (count, 3),
-            "opacity_logits": (count,),
-            "sh": (count, coefficients, 3),
-        }
-        arrays = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+        arrays = empty_arrays(numbers[-1][0].part.stop, self.sh_degree)
         for part, of_part in _in_parts(numbers):
             some = gaussians_of(of_part, self.steps)
             for name, array in arrays.items():

@@ -1,13 +1,14 @@
-"""What all kernels have in common: the instruction sets of this machine, and limits."""
+"""Helpers of all kernels: the instruction sets of this machine, limits, and cameras as numbers."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from rfcore.camera import Intrinsics, Mat3, Vec3
 from rfcore.errors import BackendUnavailable, InvalidInput
 from rfcore.native import _native
 
-__all__ = ["FLOAT32_MAX", "MAX_THREADS", "available_isas", "check_backend"]
+__all__ = ["MAX_THREADS", "available_isas", "camera_numbers", "check_backend"]
 
 MAX_THREADS = 256
 FLOAT32_MAX = float(np.finfo(np.float32).max)
@@ -32,3 +33,15 @@ def check_backend(threads: int, isa: str | None) -> str:
             f"instruction set {isa!r} is not available here; choose from {', '.join(present)}"
         )
     return present[0] if isa is None else isa
+
+
+def camera_numbers(rotation: Mat3, translation_m: Vec3, k: Intrinsics) -> list[float]:
+    """Return a camera as kernels take it: rotation (9, row-major), translation (3), fx, fy, cx, cy.
+
+    Raises ``InvalidInput`` for a number that float32 does not hold.
+    """
+    numbers = [value for row in rotation for value in row]
+    numbers += [*translation_m, k.fx_px, k.fy_px, k.cx_px, k.cy_px]
+    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
+        raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
+    return numbers

@@ -58,6 +58,7 @@ from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.native import _native
+from rfcore.native.backend import camera_numbers
 from rfcore.views import View
 
 __all__ = [
@@ -231,8 +232,8 @@ def draw_patch(
         raise InvalidInput("patch.z_m", f"{patch.z_m} m must be above 0")
     if not 0 <= source < NOBODY:
         raise InvalidInput("patch.source", f"{source} is outside 0..{NOBODY - 1}")
-    numbers = [value for row in patch_from_view.rotation_matrix() for value in row]
-    numbers += [*patch_from_view.translation_m, *_pinhole(patch.camera)]
+    rotation, k = patch_from_view.rotation_matrix(), patch.camera.intrinsics
+    numbers = camera_numbers(rotation, patch_from_view.translation_m, k)
     numbers += [float(patch.left), float(patch.top), patch.z_m, fade]
     _native.draw_patch(
         np.ascontiguousarray(patch.samples),
@@ -250,8 +251,8 @@ def draw_patch(
 
 def _numbers(source: LiveSource, camera: Camera) -> tuple[F32, F32, list[float]]:
     motion = source.camera.cam_from_world().compose(camera.world_from_cam)
-    numbers = [value for row in motion.rotation_matrix() for value in row]
-    numbers += [*motion.translation_m, *_pinhole(source.camera)]
+    k = source.camera.intrinsics
+    numbers = camera_numbers(motion.rotation_matrix(), motion.translation_m, k)
     numbers += [source.weight, source.fade, float(source.owner)]
     depth, difference = map(np.ascontiguousarray, (source.depth, source.difference))
     return difference, depth, numbers

@@ -69,6 +69,7 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
+from rfcore.native.backend import camera_numbers
 from rfcore.views import FieldView
 
 __all__ = [
@@ -95,9 +96,6 @@ MOST_RELIT_PX = 1 << 24
 """The sums of a larger picture could exceed 64 bits."""
 
 LIGHT_CELL_PX, LIGHT_BINS, LIGHT_PLANES, MOST_CHANGE = 64, 8, 3, 1 << 16
-
-Plane = NDArray[np.uint8]
-FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -146,22 +144,17 @@ def _carried(
             return made
     out = I420.empty(now.render.size_px)
     _native.warp_i420(
-        _dense(previous),
+        previous.dense_planes(),
         np.ascontiguousarray(before.depth),
         np.ascontiguousarray(now.depth),
-        _dense(now.render),
-        None if minus is None else _dense(minus),
+        now.render.dense_planes(),
+        None if minus is None else minus.dense_planes(),
         0 if minus is None else CORRECTION_DOUBT,
         warp_numbers(before.camera, now.camera),
         *out.planes,
         threads,
     )
     return out
-
-
-def _dense(picture: I420) -> tuple[Plane, Plane, Plane]:
-    y, u, v = map(np.ascontiguousarray, picture.planes)
-    return y, u, v
 
 
 def relight_i420(seen: I420, seen_render: I420, render: I420) -> I420:
@@ -174,7 +167,9 @@ def relight_i420(seen: I420, seen_render: I420, render: I420) -> I420:
         if picture.size_px != size_px:
             raise InvalidInput(f"relight.{name}", f"{picture.size_px} px of a render of {size_px}")
     out = I420.empty(render.size_px)
-    _native.relight_i420(_dense(seen), _dense(seen_render), _dense(render), *out.planes)
+    _native.relight_i420(
+        seen.dense_planes(), seen_render.dense_planes(), render.dense_planes(), *out.planes
+    )
     return out
 
 
@@ -194,7 +189,7 @@ def solve_light(frame: I420, render: I420) -> NDArray[np.int32]:
     if frame.size_px != size_px:
         raise InvalidInput("light.frame", f"{frame.size_px} px of a render of {size_px}")
     changes = np.empty(light_shape(size_px), np.int32)
-    _native.solve_light(_dense(frame), _dense(render), changes)
+    _native.solve_light(frame.dense_planes(), render.dense_planes(), changes)
     return changes
 
 
@@ -209,7 +204,7 @@ def apply_light(render: I420, changes: NDArray[np.int32]) -> I420:
         raise InvalidInput("light", f"must be of shape {shape} and within 2**16")
     out = I420.empty(render.size_px)
     dense = np.ascontiguousarray(changes, np.int32)
-    _native.apply_light(dense, _dense(render), *out.planes)
+    _native.apply_light(dense, render.dense_planes(), *out.planes)
     return out
 
 
@@ -225,12 +220,7 @@ def _check_relit(render: I420) -> tuple[int, int]:
 def warp_numbers(before: Camera, now: Camera) -> list[float]:
     """Return R (9, row-major), t (3), fx, fy, cx, cy of the warp from ``now`` into ``before``."""
     motion = before.cam_from_world().compose(now.world_from_cam)
-    k = now.intrinsics
-    numbers = [value for row in motion.rotation_matrix() for value in row]
-    numbers += [*motion.translation_m, k.fx_px, k.fy_px, k.cx_px, k.cy_px]
-    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
-        raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
-    return numbers
+    return camera_numbers(motion.rotation_matrix(), motion.translation_m, now.intrinsics)
 
 
 def block_costs(frame: NDArray[np.uint8], reference: NDArray[np.uint8]) -> BlockCosts:

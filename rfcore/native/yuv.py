@@ -84,8 +84,7 @@ def rgb_from_i420(picture: I420) -> Rgb:
     """Convert I420 to uint8 [H, W, 3]."""
     width_px, height_px = picture.size_px
     rgb = np.empty((height_px, width_px, 3), np.uint8)
-    y, u, v = (np.ascontiguousarray(plane) for plane in picture.planes)
-    _native.rgb_from_i420(y, u, v, rgb)
+    _native.rgb_from_i420(*picture.dense_planes(), rgb)
     return rgb
 
 
@@ -107,5 +106,5 @@ def digest_pair(first: I420, second: I420) -> tuple[bytes, bytes]:
     """
     if first.size_px != second.size_px:
         raise InvalidInput("second", f"{second.size_px} px beside {first.size_px} px")
-    planes = ([np.ascontiguousarray(plane) for plane in p.planes] for p in (first, second))
+    planes = (list(picture.dense_planes()) for picture in (first, second))
     return _native.blake2b_pair(first.digest_head(), *planes)

@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from rfcore.camera import Camera
-from rfcore.errors import InvalidInput
 from rfcore.native import _native
-from rfcore.native.backend import FLOAT32_MAX, check_backend
+from rfcore.native.backend import camera_numbers, check_backend
 from rfcore.ngp.shape import F32, NgpParameters, NgpShape
 from rfcore.views import View
 
@@ -21,10 +20,7 @@ __all__ = ["NgpRenderer", "native_shape", "ngp_camera"]
 def ngp_camera(camera: Camera) -> _native.NgpCamera:
     """Return the camera as the kernels take it: float32, rounded once from float64."""
     k, pose = camera.intrinsics, camera.world_from_cam
-    rotation = [value for row in pose.rotation_matrix() for value in row]
-    numbers = [*rotation, *pose.translation_m, k.fx_px, k.fy_px, k.cx_px, k.cy_px]
-    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
-        raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
+    numbers = camera_numbers(pose.rotation_matrix(), pose.translation_m, k)
     return _native.NgpCamera(numbers, k.width_px, k.height_px)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from rfcore.camera import Camera
 from rfcore.extras import needs
-from rfcore.harmonics import CONSTANT, higher_harmonics
+from rfcore.harmonics import SH_DC, higher_harmonics
 from rfcore.ngp.shape import HashGrid, NgpParameters, NgpShape, Space
 
 with needs("reference"):
@@ -145,7 +145,7 @@ def radiance(
 def harmonics(directions: Tensor) -> Tensor:
     """Return the 16 real spherical harmonics of degree 0..3 [S, 16], in the INRIA order."""
     x, y, z = directions.unbind(dim=1)
-    basis = (CONSTANT * torch.ones_like(x), *higher_harmonics(x, y, z))
+    basis = (SH_DC * torch.ones_like(x), *higher_harmonics(x, y, z))
     return torch.stack(basis, dim=1)
 
 

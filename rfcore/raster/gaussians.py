@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["MAX_GAUSSIANS", "SKY_M", "Gaussians", "joined", "sky_of", "with_sky_at"]
+__all__ = [
+    "MAX_GAUSSIANS",
+    "SKY_M",
+    "Gaussians",
+    "empty_arrays",
+    "gaussian_shapes",
+    "joined",
+    "sky_of",
+    "with_sky_at",
+]
 
 MAX_GAUSSIANS = 50_000_000
 """Upper limit accepted from files: 11.8 GB of parameters at SH degree 3."""
@@ -48,14 +57,7 @@ class Gaussians:
             raise InvalidInput(
                 "gaussians.sh", f"shape {self.sh.shape} is not [N, K, 3] with K = 1, 4, 9 or 16"
             )
-        expected = {
-            "means": (n, 3),
-            "quaternions": (n, 4),
-            "log_scales": (n, 3),
-            "opacity_logits": (n,),
-            "sh": (n, self.sh.shape[1], 3),
-        }
-        for name, shape in expected.items():
+        for name, shape in gaussian_shapes(n, self.sh_degree).items():
             array = getattr(self, name)
             if array.shape != shape:
                 raise InvalidInput(f"gaussians.{name}", f"shape {array.shape}, expected {shape}")
@@ -75,6 +77,23 @@ class Gaussians:
     def sh_degree(self) -> int:
         """Degree D of the spherical harmonics, 0..3."""
         return isqrt(self.sh.shape[1]) - 1
+
+
+def gaussian_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays of ``count`` Gaussians, by name."""
+    return {
+        "means": (count, 3),
+        "quaternions": (count, 4),
+        "log_scales": (count, 3),
+        "opacity_logits": (count,),
+        "sh": (count, (sh_degree + 1) ** 2, 3),
+    }
+
+
+def empty_arrays(count: int, sh_degree: int) -> dict[str, F32]:
+    """Return arrays for ``count`` Gaussians, whose numbers are still to be written."""
+    shapes = gaussian_shapes(count, sh_degree)
+    return {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
 
 
 def sky_of(means: F32) -> NDArray[np.bool_]:

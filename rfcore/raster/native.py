@@ -25,7 +25,7 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
-from rfcore.native.backend import FLOAT32_MAX, check_backend
+from rfcore.native.backend import camera_numbers, check_backend
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.renderers import DEVICES, is_opencl
@@ -67,11 +67,8 @@ class RasterStatistics:
 def native_camera(camera: Camera) -> _native.RasterCamera:
     """Return the camera as the kernels take it: float32, rounded once; the position as two."""
     k = camera.intrinsics
-    rotation = [value for row in camera.cam_from_world().rotation_matrix() for value in row]
-    numbers = [*rotation, *camera.world_from_cam.translation_m]
-    numbers += [k.fx_px, k.fy_px, k.cx_px, k.cy_px]
-    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
-        raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
+    rotation = camera.cam_from_world().rotation_matrix()
+    numbers = camera_numbers(rotation, camera.world_from_cam.translation_m, k)
     return _native.RasterCamera(numbers, k.width_px, k.height_px)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from rfcore.camera import Camera
 from rfcore.extras import needs
-from rfcore.harmonics import CONSTANT, higher_harmonics
+from rfcore.harmonics import SH_DC, higher_harmonics
 from rfcore.raster.gaussians import SKY_M, Gaussians
 
 with needs("reference"):
@@ -134,7 +134,7 @@ def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     Signs and order of the INRIA implementation: Y_lm with m = -l..l, Condon-Shortley phase in.
     """
     x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, CONSTANT), *higher_harmonics(x, y, z)]
+    basis = [torch.full_like(x, SH_DC), *higher_harmonics(x, y, z)]
     return torch.stack(basis[: (degree + 1) ** 2], dim=-1)
 
 

@@ -18,7 +18,7 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.native import _native
 from rfcore.native.backend import check_backend
-from rfcore.raster.gaussians import F32, MAX_GAUSSIANS, Gaussians
+from rfcore.raster.gaussians import F32, MAX_GAUSSIANS, Gaussians, empty_arrays
 from rfcore.raster.native import bands_to_use, native_camera, overlaps_limited
 from rfcore.views import View
 
@@ -336,15 +336,7 @@ class TrainableRasterizer:
             raise InvalidInput(caller, "no gradients: call backward() first")
 
     def _empty_arrays(self) -> dict[str, F32]:
-        n, coefficients = len(self), (self.sh_degree + 1) ** 2
-        shapes = {
-            "means": (n, 3),
-            "quaternions": (n, 4),
-            "log_scales": (n, 3),
-            "opacity_logits": (n,),
-            "sh": (n, coefficients, 3),
-        }
-        return {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+        return empty_arrays(len(self), self.sh_degree)
 
 
 def _check_picture(name: str, picture: F32, like: F32) -> None:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics
 from rfcore.errors import InvalidInput
+from rfcore.harmonics import SH_DC
 from rfcore.image import Rgb
 from rfcore.raster.gaussians import SKY_M, Gaussians
 from rfcore.train.targets import Target
@@ -177,7 +178,6 @@ MIN_SPACING_M = 1e-3
 """Coincident points have no spacing; this keeps their logarithm finite."""
 MAX_SPACING_M = 20.0
 """A stray point far from all others would cover the picture."""
-SH_DC = math.sqrt(1 / (4 * math.pi))
 LEAF_POINTS = 16
 QUERIES = 4096
 """Points whose neighbours are looked for at a time: what they need stays in the cache."""

@@ -130,16 +130,11 @@ def _position_and_axis(
 
 def _carried(difference: _Difference, now: FieldView) -> NDArray[np.uint8]:
     """Return the other frame's levels where ``now`` sees them, at most of each 3x3 blocks."""
-    height, width = difference.levels.shape
-    half = np.full(((height + 1) // 2, (width + 1) // 2), 128, np.uint8)
-    blank = FieldView(now.camera, _flat(now.render, UNKNOWN), now.depth)
-    carried = warp_i420(I420(difference.levels, half, half), difference.view, blank).y
+    picture = I420.filled(now.render.size_px)
+    blank = FieldView(now.camera, I420.filled(now.render.size_px, UNKNOWN), now.depth)
+    levels = I420(difference.levels, picture.u, picture.v)
+    carried = warp_i420(levels, difference.view, blank).y
     return _most_around(carried)
-
-
-def _flat(like: I420, level: int) -> I420:
-    y, u, v = (np.full(plane.shape, level, np.uint8) for plane in like.planes)
-    return I420(y, u, v)
 
 
 def _most_around(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:

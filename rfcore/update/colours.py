@@ -26,7 +26,6 @@ from rfcore.field.layer import (
     MIDDLE_LUMA,
     OFFSET_STEP,
     OWN_STEP,
-    SH_DC,
     SLOPE_STEP,
     VOXELS_M,
     ColourLayer,
@@ -37,6 +36,7 @@ from rfcore.field.layer import (
     rgb_of,
     voxels_of,
 )
+from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import TrainableRasterizer

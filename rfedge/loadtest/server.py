@@ -14,8 +14,6 @@ import sys
 from collections import OrderedDict
 from pathlib import Path
 
-import numpy as np
-
 from mec_server.__main__ import serve
 from mec_server.config import AdmissionLimits, ServerBudget, ServerConfig
 from mec_server.reconstruction import (
@@ -45,10 +43,7 @@ class PassingDecoder:
     """Takes frames without looking at their pictures."""
 
     def __init__(self, camera: CameraDescription) -> None:
-        width_px, height_px = camera.intrinsics.width_px, camera.intrinsics.height_px
-        half = ((height_px + 1) // 2, (width_px + 1) // 2)
-        luma = np.full((height_px, width_px), 128, np.uint8)
-        self._grey = I420(luma, np.full(half, 128, np.uint8), np.full(half, 128, np.uint8))
+        self._grey = I420.filled((camera.intrinsics.width_px, camera.intrinsics.height_px))
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         """Return grey; the session has checked the packet's CRC before there was a job."""

@@ -6,8 +6,8 @@ from cav_agent.lights import FITS_LEVELS, LOOK_EVERY, TileLights
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.block_means import median_block_mean_difference
 from rfcore.field import FULL, FieldMetadata, Quality, SplatField
-from rfcore.field.layer import SH_DC
 from rfcore.field.quality import Beginning
+from rfcore.harmonics import SH_DC
 from rfcore.image import I420
 from rfcore.raster.gaussians import Gaussians
 

@@ -24,7 +24,7 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.ladder import FULL_RUNG
 from rfcore.dataset import read_dataset
 from rfcore.field import RadianceField, SplatField, load_field, render_field_view
-from rfcore.field.layer import SH_DC
+from rfcore.harmonics import SH_DC
 from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.native.yuv import i420_from_rgb
 

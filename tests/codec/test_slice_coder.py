@@ -29,7 +29,7 @@ from rfcore.codec.h264.slice_coder import (
     SliceCoder,
 )
 from rfcore.codec.h264.slices import encode_slice
-from rfcore.codec.h264.splice import SpliceDecoder, grey
+from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.errors import BackendUnavailable, InvalidInput
 from rfcore.image import I420
 from rfcore.native.backend import available_isas
@@ -46,7 +46,8 @@ KINDS = ("near", "noise", "unrelated", "zoomed")
 def header_of(size: Size) -> StreamHeader:
     """The parameter sets that x264 writes."""
     config = CodecConfig(*size, effort="x264-medium")
-    return encode_slice(config, [grey(config)], grey(config)).header
+    grey = I420.filled(config.size_px)
+    return encode_slice(config, [grey], grey).header
 
 
 @cache

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.gaussians import Gaussians, gaussian_shapes
 
 Make = Callable[..., Gaussians]
 
@@ -16,13 +16,7 @@ def make_gaussians() -> Make:
 
     def make(n: int = 5, sh_degree: int = 3, seed: int = 0) -> Gaussians:
         rng = np.random.default_rng(seed)
-        shapes = {
-            "means": (n, 3),
-            "quaternions": (n, 4),
-            "log_scales": (n, 3),
-            "opacity_logits": (n,),
-            "sh": (n, (sh_degree + 1) ** 2, 3),
-        }
+        shapes = gaussian_shapes(n, sh_degree)
         return Gaussians(**{k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()})
 
     return make

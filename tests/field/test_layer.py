@@ -11,7 +11,6 @@ from rfcore.errors import FieldFormatError, InvalidInput, UnknownField
 from rfcore.field import FieldStore, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.layer import (
-    SH_DC,
     VOXELS_M,
     ColourLayer,
     layer_archive,
@@ -20,6 +19,7 @@ from rfcore.field.layer import (
     voxels_of,
 )
 from rfcore.field.store import decode_field, encode_field
+from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
 
 Make = Callable[..., Gaussians]

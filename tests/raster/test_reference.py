@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.reference import (
     loss_l1_dssim,
@@ -17,7 +18,6 @@ from rfcore.raster.reference import (
     spherical_harmonics,
 )
 
-SH_DC = 0.28209479177387814
 AHEAD = Camera(Intrinsics(32, 24, 30.0, 28.0, 16.0, 12.0), Pose.identity())
 Params = dict[str, Tensor]
 

@@ -15,7 +15,7 @@ from mec_server.tile_learning import LearningJob, LearningRounds
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
 from rfcore.field import SplatField, save_field
-from rfcore.field.layer import SH_DC
+from rfcore.harmonics import SH_DC
 from rfcore.image import Rgb, write_png
 from rfcore.raster.gaussians import Gaussians
 from rfcore.update.passes import Pass

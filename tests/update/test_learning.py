@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.field.interface import base_of
-from rfcore.field.layer import SH_DC
 from rfcore.field.store import decode_field, encode_field
+from rfcore.harmonics import SH_DC
 from rfcore.image import Rgb
 from rfcore.raster.gaussians import Gaussians
 from rfcore.update.agreement import trusted_pixels

@@ -100,8 +100,7 @@ def write_macroblocks(picture: I420, out: NDArray[np.uint8]) -> None:
         raise InvalidInput(
             "out", f"shape {out.shape} for a picture of {picture.size_px} px, not ({expected},)"
         )
-    y, u, v = (np.ascontiguousarray(plane) for plane in picture.planes)
-    _native.pcm_macroblocks(y, u, v, out)
+    _native.pcm_macroblocks(*picture.dense_planes(), out)
 
 
 def _samples_bytes(size_px: tuple[int, int]) -> int:

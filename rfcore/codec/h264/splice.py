@@ -14,10 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
-import numpy as np
-
 from rfcore.codec.h264.bitstream import join_nals
-from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.header import StreamHeader, check_header
 from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_start
@@ -25,7 +22,7 @@ from rfcore.codec.h264.pcm_picture import PcmPictures, PcmPlace, pcm_pps
 from rfcore.errors import BitstreamError, CodecError
 from rfcore.image import I420
 
-__all__ = ["PictureDecoder", "SpliceDecoder", "grey"]
+__all__ = ["PictureDecoder", "SpliceDecoder"]
 
 _P_SLICE, _I_SLICE = 0, 2
 
@@ -86,7 +83,7 @@ class SpliceDecoder:
         """Make ``pictures`` the references, the last one reference 0; none prepares for an IDR
         picture. Raises ``CodecError`` if the decoder fails. The caller checks sizes and number.
         """
-        fed: Sequence[I420] = pictures or [grey(self._config)]
+        fed: Sequence[I420] = pictures or [I420.filled(self._config.size_px)]
         self._idr_pic_id ^= 3  # 1 and 2 by turns
         for frame_num, picture in enumerate(fed):
             place = PcmPlace(self._log2_max_frame_num, frame_num, self._idr_pic_id)
@@ -121,10 +118,3 @@ class SpliceDecoder:
         except CodecError:
             self.reset()
             raise
-
-
-def grey(config: CodecConfig) -> I420:
-    """Return a grey picture of the configured size."""
-    width_px, height_px = config.size_px
-    half = ((height_px + 1) // 2, (width_px + 1) // 2)
-    return I420(*(np.full(s, 128, np.uint8) for s in ((height_px, width_px), half, half)))

@@ -18,7 +18,6 @@ from rfcore.codec.h264.header import StreamHeader, own_header
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.h264.slice_coder import Effort, SliceCoder
 from rfcore.codec.h264.slices import SliceCoding, encode_slice
-from rfcore.codec.h264.splice import grey
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
@@ -88,7 +87,8 @@ class _X264PictureCoder:
     def __init__(self, config: CodecConfig, threads: int) -> None:
         self._config = config
         self._threads = threads
-        self.header = encode_slice(config, [grey(config)], grey(config)).header
+        grey = I420.filled(config.size_px)
+        self.header = encode_slice(config, [grey], grey).header
 
     def code(self, frame: I420, references: Sequence[I420], request: CodingRequest) -> CodedPicture:
         _require_coder(request.effort, Coder.X264)

@@ -166,8 +166,7 @@ def _points(curve: RateCurve) -> dict[str, list[float]]:
 
 
 def _on_flat_ground(frame: I420, block: Mask) -> I420:
-    flat = I420(*(np.full_like(plane, GROUND_LEVEL) for plane in frame.planes))
-    return composed(frame, flat, block)
+    return composed(frame, I420.filled(frame.size_px, GROUND_LEVEL), block)
 
 
 def composed(front: I420, behind: I420, block: Mask) -> I420:
