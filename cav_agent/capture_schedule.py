@@ -1,20 +1,29 @@
 """When the next picture of a drive is captured: the first step of a frame's path.
 
 ``Realtime`` captures picture i at its time, whatever became of the ones before. ``Lockstep``
-captures the next when the previous was answered, and one that was lost again; an experiment then
-covers every picture, at the speed of the link or the rate that a full server grants. State machines
-without a clock: ``now`` is an argument. ``cav_agent.handover_controller`` asks them and decides
-which server takes the picture.
+captures the next picture when the previous one was answered, and a lost one again. An experiment
+then covers every picture, at the speed of the link or the rate that a full server grants. Both are
+state machines without a clock: ``now`` is an argument. ``cav_agent.handover_controller`` asks them
+and decides which server takes the picture.
 """
 
 from __future__ import annotations
 
 from typing import Protocol
 
+from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.frames import EndReason, FrameResult, Outcome
 from rfcore.errors import InvalidInput, RfedgeError
 
-__all__ = ["MAX_TRIES", "ROUNDING_S", "CaptureSchedule", "Lockstep", "Realtime"]
+__all__ = [
+    "MAX_TRIES",
+    "ROUNDING_S",
+    "CaptureSchedule",
+    "Lockstep",
+    "RateLimit",
+    "Realtime",
+    "recorded_schedule",
+]
 
 ROUNDING_S = 1e-6
 """Tolerance for the rounding error of summed periods."""
@@ -33,7 +42,7 @@ class CaptureSchedule(Protocol):
         """Return, once, the index of the picture to capture now, or None."""
 
     def ended(self, result: FrameResult) -> None:
-        """Take note of how a captured picture ended; raise ``RfedgeError`` to give up."""
+        """Note how a captured picture ended; raise ``RfedgeError`` to give up."""
 
     def get_timer(self) -> float | None:
         """Return when ``next_capture`` will have a picture by time alone, or None."""
@@ -44,6 +53,28 @@ class CaptureSchedule(Protocol):
     @property
     def finished(self) -> bool:
         """Whether no further picture will be captured."""
+
+
+class RateLimit:
+    """Allows so many captures per second on average; 0 Hz, as at first: any number."""
+
+    def __init__(self) -> None:
+        self.period_s = 0.0
+        self.open_s = float("-inf")
+        """When the next capture is allowed."""
+
+    def set_hz(self, rate_hz: float) -> None:
+        """Allow ``rate_hz`` captures per second from now on."""
+        self.period_s = 1.0 / rate_hz if rate_hz else 0.0
+
+    def allows(self, at_s: float) -> bool:
+        """Return whether a picture may be captured at a time."""
+        return at_s >= self.open_s - ROUNDING_S
+
+    def captured(self, at_s: float) -> None:
+        """Note that a picture was captured."""
+        is_behind = self.open_s < at_s - self.period_s
+        self.open_s = (at_s if is_behind else self.open_s) + self.period_s
 
 
 class Realtime:
@@ -57,8 +88,7 @@ class Realtime:
         self._pictures, self._rate_hz, self._loop = pictures, rate_hz, loop
         self._count = 0
         self._start_s: float | None = None
-        self._period_s = 0.0
-        self._open_s = float("-inf")
+        self._limit = RateLimit()
 
     def next_capture(self, now: float) -> int | None:
         """Return the next index once its time has come."""
@@ -66,15 +96,14 @@ class Realtime:
             self._start_s = now
         while not self.finished and now >= (due_s := self._due_s(self._start_s)):
             self._count += 1
-            if due_s >= self._open_s - ROUNDING_S:
-                behind = self._open_s < due_s - self._period_s
-                self._open_s = (due_s if behind else self._open_s) + self._period_s
+            if self._limit.allows(due_s):
+                self._limit.captured(due_s)
                 return (self._count - 1) % self._pictures
         return None
 
     def limit(self, rate_hz: float) -> None:
         """Capture no more than ``rate_hz`` pictures per second on average."""
-        self._period_s = 1.0 / rate_hz if rate_hz else 0.0
+        self._limit.set_hz(rate_hz)
 
     def ended(self, result: FrameResult) -> None:
         """Do nothing: the schedule does not depend on it."""
@@ -95,11 +124,11 @@ class Realtime:
 
 
 class Lockstep:
-    """The next picture when the previous was answered, no sooner than the server's limit allows; a
-    lost one again.
+    """The next picture when the previous was answered, no sooner than the server's limit allows.
 
-    Of a rig of several ``cameras`` the next instant when all its pictures have ended, all of them
-    again when one was lost. A camera whose picture cannot be coded does not hold up the others.
+    A lost picture is captured again. A rig of several ``cameras`` captures its next instant when
+    all pictures of the last have ended, and all of them again when one was lost. A camera whose
+    picture cannot be coded does not hold up the others.
     """
 
     def __init__(self, pictures: int, *, cameras: int = 1, loop: bool = False) -> None:
@@ -109,15 +138,14 @@ class Lockstep:
         self._index = 0
         self._tries = 0
         self._waiting = False
-        self._period_s = 0.0
-        self._captured_s = float("-inf")
+        self._limit = RateLimit()
 
     def next_capture(self, now: float) -> int | None:
         """Return the index to capture, unless one is on its way or the limit is reached."""
-        if self._waiting or self.finished or now < self._captured_s + self._period_s - ROUNDING_S:
+        if self._waiting or self.finished or not self._limit.allows(now):
             return None
         self._waiting = True
-        self._captured_s = now
+        self._limit.captured(now)
         self._tries += 1
         return self._index % self._pictures
 
@@ -141,19 +169,26 @@ class Lockstep:
             raise RfedgeError(f"picture {name} was lost {self._tries} times: {result.explanation}")
 
     def limit(self, rate_hz: float) -> None:
-        """Capture no more than ``rate_hz`` pictures per second."""
-        self._period_s = 1.0 / rate_hz if rate_hz else 0.0
+        """Capture no more than ``rate_hz`` pictures per second on average."""
+        self._limit.set_hz(rate_hz)
 
     def get_timer(self) -> float | None:
         """Return when the limit allows the next picture, if nothing else is waited for."""
-        if self._waiting or self.finished or not self._period_s:
+        if self._waiting or self.finished or not self._limit.period_s:
             return None
-        return self._captured_s + self._period_s
+        return self._limit.open_s
 
     @property
     def finished(self) -> bool:
         """Whether every picture was answered."""
         return not self._loop and self._index >= self._pictures
+
+
+def recorded_schedule(config: AgentConfig, pictures: int, cameras: int) -> CaptureSchedule:
+    """Return when the pictures of a recorded drive are captured."""
+    if config.pace is PaceKind.LOCKSTEP:
+        return Lockstep(pictures, cameras=cameras, loop=config.loop)
+    return Realtime(pictures, config.rate, loop=config.loop)
 
 
 def _check(pictures: int, rate_hz: float) -> None:

@@ -38,7 +38,14 @@ from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import FieldNotice, Welcome
 from rfcore.wire.notices import StreetNotice
 
-__all__ = ["CameraSource", "CameraTaken", "FieldNotServed", "StreamClient", "StreamObserver"]
+__all__ = [
+    "CameraSource",
+    "CameraTaken",
+    "FieldNotServed",
+    "StreamClient",
+    "StreamObserver",
+    "StreamOwner",
+]
 
 log = structlog.get_logger()
 Stream = grpc.aio.StreamStreamCall[bytes, bytes]
@@ -76,11 +83,18 @@ class FieldNotServed(ProtocolError):
     """The server does not hold the stream's field (any more); its tiles are to be relearned."""
 
 
-class StreamObserver(Protocol):
-    """Hears of everything that happens to the pictures of a stream and to its connection."""
+class StreamOwner(Protocol):
+    """Who opened a stream and gives it pictures."""
 
     def ended(self, result: FrameResult) -> None:
         """A captured picture came to its end; raise ``RfedgeError`` to end the stream."""
+
+    def welcomed(self) -> None:
+        """The server takes pictures now."""
+
+
+class StreamObserver(Protocol):
+    """Records what happens to a stream's connection."""
 
     def connected(self, is_connected: bool) -> None:
         """The server welcomed the vehicle, or its stream was lost."""
@@ -89,7 +103,7 @@ class StreamObserver(Protocol):
         """Something failed and will be tried again."""
 
     def noticed(self, notice: StreetNotice) -> None:
-        """The server told of the street."""
+        """The server sent a notice of the street."""
 
     def message_unknown(self) -> None:
         """The server sent a message that this agent does not know, and ignores."""
@@ -97,8 +111,7 @@ class StreamObserver(Protocol):
 
 @dataclass(frozen=True)
 class CameraSource:
-    """What takes the pictures of an instant by its number, posed for the stream's tile, and what
-    encodes them."""
+    """Takes the pictures at a place of the drive, posed for the stream's tile, and encodes them."""
 
     take: Callable[[int], Sequence[Capture]]
     encode: Callable[[EncodeJob], EncodedFrame]
@@ -106,13 +119,17 @@ class CameraSource:
 
 
 class StreamClient:
-    """Streams what ``capture`` takes to one server, until ``finish``; ``tile`` names the place."""
+    """Streams what ``capture`` takes to one server, until ``finish``.
+
+    ``tile``: the name of the tile, by which a proxy places the stream.
+    """
 
     def __init__(
         self,
         server: ServerConnection,
         session: AgentSession,
         source: CameraSource,
+        owner: StreamOwner,
         observer: StreamObserver,
         limits: AgentLimits,
         *,
@@ -123,6 +140,7 @@ class StreamClient:
         self._server = server
         self._session = session
         self._source = source
+        self._owner = owner
         self._observer = observer
         self._limits = limits
         self._stream: Stream | None = None
@@ -141,9 +159,9 @@ class StreamClient:
         return not self._is_finishing and self._session.state is LinkState.STREAMING
 
     @property
-    def is_sent_away(self) -> bool:
-        """Whether the server is about to stop, and takes pictures until another one does."""
-        return self._session.is_sent_away
+    def is_draining(self) -> bool:
+        """Whether the server is draining: it takes pictures until another one does."""
+        return self._session.is_draining
 
     @property
     def rate_limit_hz(self) -> float:
@@ -227,7 +245,7 @@ class StreamClient:
 
     def _report_ended(self) -> None:
         for result in self._session.take_results():
-            self._observer.ended(result)
+            self._owner.ended(result)
 
     def _is_done(self, now: float) -> bool:
         if self._stopping_until_s is not None and now >= self._stopping_until_s:
@@ -336,6 +354,7 @@ class StreamClient:
                 if isinstance(message, Welcome):
                     self._times_taken = 0
                     self._observer.connected(True)
+                    self._owner.welcomed()
                 elif isinstance(message, FieldNotice):
                     self._server.fields_changed.set()
                 elif isinstance(message, StreetNotice):

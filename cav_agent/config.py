@@ -10,7 +10,7 @@ from typing import Annotated
 from tyro.conf import Suppress, arg
 
 from cav_agent.live.settings import LiveSettings
-from cav_agent.pose_feed.settings import PoseFeedSettings
+from cav_agent.pose_feed.sources import PoseFeedSettings
 from rfcore.codec.h264.config import CRF_RANGE, CoderSettings
 from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.errors import InvalidInput
@@ -29,6 +29,8 @@ class AgentLimits:
     answer_s: Annotated[float, Suppress] = 5.0
     """From encoding to Ack or Nack, before the stream is given up; less once the server's usual
     time is known (``AnswerTimeout``)."""
+    stall_s: Annotated[float, Suppress] = 1.0
+    """How long a server may pause beyond its usual time."""
     give_up_s: Annotated[float, arg(name="give-up-s")] = 0.0
     """How many seconds without any server before the drive ends with an error; 0: never."""
     drain_s: Annotated[float, Suppress] = 5.0
@@ -36,7 +38,7 @@ class AgentLimits:
     slot_frames: Annotated[int, Suppress] = 1
 
     def __post_init__(self) -> None:
-        for name in ("greeting_s", "answer_s"):
+        for name in ("greeting_s", "answer_s", "stall_s"):
             if not getattr(self, name) > 0:
                 raise InvalidInput(f"limits.{name}", f"{getattr(self, name)} must be above 0 s")
         for name in ("give_up_s", "drain_s"):

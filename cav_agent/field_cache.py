@@ -10,7 +10,6 @@ field arrives.
 from __future__ import annotations
 
 import asyncio
-import itertools
 from collections import OrderedDict
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, replace
@@ -19,30 +18,20 @@ from typing import Any
 
 import structlog
 
+from cav_agent.cameras import VehicleCamera, VehicleCameras, instant_numbers, recorded_cameras
 from cav_agent.config import AgentConfig
 from cav_agent.deadline import DeadlineController, DeadlineRungs, FixedRung, Rungs
-from cav_agent.drive_pictures import (
-    OneCamera,
-    RecordedPictures,
-    RecordedRig,
-    VehicleCamera,
-    VehiclePictures,
-)
 from cav_agent.field_fetch import Beginnings, fetch_field
 from cav_agent.frame_log import DriveObserver
 from cav_agent.handover import ServedTile
 from cav_agent.lights import TileLights
 from cav_agent.server_connection import ServerConnection
-from rfcore.camera import TileOrigin
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.sender.ladder import MeasuredRung, Rung, read_ladder
-from rfcore.dataset import read_dataset
-from rfcore.dataset.rig import read_rig, read_rig_drive
-from rfcore.errors import FieldFormatError, InvalidInput, RfedgeError, UnknownField
+from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
 from rfcore.field import FULL, FieldStore, RadianceField
 from rfcore.field.store import decode_beginning
-from rfcore.views import PosedPicture
 from rfcore.wire.tiles import Tile
 
 __all__ = [
@@ -50,7 +39,6 @@ __all__ = [
     "FieldCache",
     "PreparedCamera",
     "PreparedField",
-    "read_drive",
 ]
 
 log = structlog.get_logger()
@@ -79,7 +67,7 @@ class PreparedField:
     """A field that is ready to code against, and the drive as seen in its tile."""
 
     field: RadianceField
-    pictures: VehiclePictures
+    pictures: VehicleCameras
     """Posed relative to the field's tile origin, or not posed: a live camera's."""
     cameras: tuple[PreparedCamera, ...]
     rungs: Rungs
@@ -99,11 +87,11 @@ class FieldCache:
         config: AgentConfig,
         servers: Sequence[ServerConnection],
         observer: DriveObserver,
-        live: VehiclePictures | None = None,
+        live: VehicleCameras | None = None,
     ) -> None:
         self._config = config
         self._live = live
-        self._instants = itertools.count(1)
+        self._instants = instant_numbers(config)
         self._servers = tuple(servers)
         self._observer = observer
         self._prepared: OrderedDict[Tile, asyncio.Task[PreparedField]] = OrderedDict()
@@ -274,21 +262,14 @@ class FieldCache:
         self, field: RadianceField, lights: TileLights, field_ids: tuple[str, ...]
     ) -> PreparedField:
         config = self._config
-        pictures = self._live or self._recorded(field.metadata.tile_origin)
+        origin = field.metadata.tile_origin
+        pictures = self._live or recorded_cameras(config, origin, self._instants)
         cameras = tuple(_prepared_camera(config, camera) for camera in pictures.cameras)
         ladder = self._ladder(field)
         rungs = self._rungs(ladder)
         _prepare_renderers(field, ladder)
         self._observer.field_ready(field, len(pictures))
         return PreparedField(field, pictures, cameras, rungs, lights, field_ids)
-
-    def _recorded(self, origin: TileOrigin) -> VehiclePictures:
-        config = self._config
-        if config.rig is None:
-            pictures = RecordedPictures(read_drive(config, origin))
-            return OneCamera(config.camera, pictures, config.masking)
-        rig = read_rig(config.rig)
-        return RecordedRig(rig, read_rig_drive(rig, origin), self._instants)
 
     def _ladder(self, field: RadianceField) -> tuple[MeasuredRung, ...]:
         """Return the rungs that a deadline chooses from; none without one."""
@@ -358,33 +339,7 @@ def _prepared_camera(config: AgentConfig, camera: VehicleCamera) -> PreparedCame
     return PreparedCamera(camera, codec, settings.qp_map(codec.size_px))
 
 
-def read_drive(config: AgentConfig, origin: TileOrigin) -> tuple[PosedPicture, ...]:
-    """Return the drive's pictures posed relative to ``origin``.
-
-    Poses are rounded as on the wire before anything is rendered at them, so that both ends render
-    at the same one. Raises ``InvalidInput`` unless all pictures are of one camera.
-    """
-    if config.drive is None:
-        raise InvalidInput("drive", "is missing")
-    pictures = read_dataset(config.drive, tile_origin=origin).pictures
-    intrinsics = pictures[0].camera.intrinsics
-    for picture in pictures:
-        if picture.camera.intrinsics != intrinsics:
-            raise InvalidInput(
-                "drive",
-                f"{picture.name} has other intrinsics than {pictures[0].name}; "
-                "one stream is one camera",
-            )
-    return tuple(map(_with_rounded_pose, pictures))
-
-
 def _prepare_renderers(field: RadianceField, ladder: Sequence[MeasuredRung]) -> None:
     """Make every renderer that frames may ask for."""
     for quality in {FULL, *(measured.rung.quality for measured in ladder)}:
         field.prepare(replace(quality, detail=min(quality.detail, field.most_detail)))
-
-
-def _with_rounded_pose(picture: PosedPicture) -> PosedPicture:
-    camera = picture.camera
-    rounded = camera.rounded()
-    return replace(picture, camera=rounded)

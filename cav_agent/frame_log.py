@@ -1,14 +1,13 @@
-"""What is recorded of a drive: a line of JSON per picture, log lines, and metrics.
+"""Records a drive: a line of JSON per picture, log lines, and metrics.
 
-``DriveObserver`` is the one place that hears of everything that happens to the vehicle's frames,
-streams and fields. Frames are counted when they have ended, however they ended.
+``DriveObserver`` hears of everything that happens to the vehicle's frames, streams and fields.
+Frames are counted when they have ended, however they ended.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, TextIO
 
 import structlog
@@ -26,37 +25,26 @@ from rfcore.wire.address import Address
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.sensing import ClockKind
 
-__all__ = ["DriveObserver", "FrameLog", "log_line"]
+__all__ = ["DriveObserver", "log_line"]
 
 log = structlog.get_logger()
 
-TOLD_OFFSET_S = 0.1
+LOGGED_OFFSET_S = 0.1
 """A change of the pose feed's time offset by less is not logged."""
 
 
-class FrameLog:
-    """Writes a line per picture as it ends; the file is complete up to its last line."""
-
-    def __init__(self, path: Path) -> None:
-        self._file: TextIO = path.open("w", buffering=1)
-
-    def ended(self, result: FrameResult) -> None:
-        """Append one line."""
-        self._file.write(json.dumps(log_line(result)) + "\n")
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
 class DriveObserver:
-    """Turns the events of a drive into metrics, log lines and, if given, the frame log."""
+    """Turns the events of a drive into metrics, log lines and, if given, the frame log.
+
+    ``frame_log``: a file that gets a line of JSON per picture. ``notice_takers`` are called with
+    each notice of the street.
+    """
 
     def __init__(
         self,
         metrics: AgentMetrics,
         servers: Sequence[Address],
-        frame_log: FrameLog | None = None,
+        frame_log: TextIO | None = None,
         notice_takers: Sequence[Callable[[StreetNotice], None]] = (),
     ) -> None:
         self._metrics = metrics
@@ -66,102 +54,107 @@ class DriveObserver:
         self._quality_steps = QualitySteps()
         self._pose_state: LocalisationState | None = None
         self._feed_offset_s: float | None = None
-        self._log = log
-
-    def of_camera(self, camera_id: str) -> DriveObserver:
-        """Return an observer of one source of a rig, which names its camera in the log."""
-        named = DriveObserver(self._metrics, self._servers, self._frame_log, self._notice_takers)
-        named._log = log.bind(camera=camera_id)
-        return named
 
     def ended(self, result: FrameResult) -> None:
         """A captured picture came to its end."""
         self._metrics.ended(result)
         self._log_pose(result)
         if self._frame_log is not None:
-            self._frame_log.ended(result)
+            self._frame_log.write(json.dumps(log_line(result)) + "\n")
         _log_failure(result)
         self._log_quality(result)
 
     def connected(self, is_connected: bool) -> None:
         """A server welcomed the vehicle, or its stream was lost."""
-        self._metrics.connected(is_connected)
+        self._metrics.connected.set(is_connected)
+        if not is_connected:
+            self._metrics.connections_lost.inc()
 
     def retrying(self, reason: RetryReason) -> None:
         """Something failed and will be tried again."""
-        self._metrics.retrying(reason)
+        self._metrics.retries.labels(reason).inc()
 
     def noticed(self, notice: StreetNotice) -> None:
-        """A server told of the street."""
-        self._metrics.noticed(notice)
+        """A server sent a notice of the street."""
+        self._metrics.notices.labels(notice.kind).inc()
         for take in self._notice_takers:
             take(notice)
 
     def message_unknown(self) -> None:
         """A server sent a message that this agent does not know."""
-        self._metrics.message_unknown()
+        self._metrics.unknown_messages.inc()
 
     def handed_over(self, served: ServedTile, cause: HandoverCause) -> None:
         """``served`` takes the vehicle's pictures now."""
-        self._metrics.handed_over(cause)
+        self._metrics.handovers.labels(cause).inc()
         server = str(self._servers[served.server])
         log.info("handed over", server=server, tile=served.tile.name, cause=str(cause))
 
     def field_fetched(self, size_bytes: int) -> None:
         """An archive was fetched."""
-        self._metrics.field_fetched(size_bytes)
+        self._metrics.field_bytes.inc(size_bytes)
 
     def field_ready(self, field: RadianceField, pictures: int) -> None:
         """A field was opened and can be coded against."""
-        self._metrics.field_ready(field.field_id, field.metadata.kind)
+        self._metrics.field_info.labels(field.field_id[:16], field.metadata.kind).set(1)
         log.info("ready", pictures=pictures, field=field.field_id, isa=field.isa)
 
     def coded_under_deadline(self, controller: DeadlineController, step: Step | None) -> None:
         """A frame was coded under a deadline; ``step`` is the change of rung that followed."""
-        self._metrics.coded_under_deadline(controller.position, step, controller.late)
+        self._metrics.rung.set(controller.position)
+        if controller.late:
+            self._metrics.deadline_missed.inc()
         if step is not None:
+            direction = "down" if step.down else "up"
+            self._metrics.rung_steps.labels(direction).inc()
             log.info(
-                "stepped down" if step.down else "stepped up",
+                f"stepped {direction}",
                 before=step.before.rung.name,
                 rung=step.after.rung.name,
                 slowness=round(step.slowness, 2),
             )
 
+    def feed_fixes(self, fixes: int) -> None:
+        """So many more fixes of the pose feed are used."""
+        self._metrics.feed_fixes.inc(fixes)
+
     def feed_problem(self, problem: FeedProblem, text: str, begins: bool) -> None:
-        """Something is wrong with the pose feed: counted, and said where it begins."""
-        self._metrics.feed_problem(problem)
+        """Something is wrong with the pose feed: counted each time, logged when it begins."""
+        self._metrics.feed_problems.labels(problem).inc()
         if begins:
             log.warning("pose feed", reason=str(problem), problem=text)
 
-    def source_open(self, clock: ClockKind) -> None:
-        """Frames of the live source come, their times from ``clock``."""
-        self._metrics.source_open(clock)
-        self._log.info("source open", capture_clock=str(clock))
+    def source_open(self, camera_id: str, clock: ClockKind) -> None:
+        """Frames of a live source come, their times from ``clock``."""
+        self._metrics.source_open.set(1)
+        for kind in ClockKind:
+            self._metrics.capture_clock.labels(kind).set(kind is clock)
+        log.info("source open", camera=camera_id, capture_clock=str(clock))
 
-    def source_lost(self, problem: SourceProblem, text: str, begins: bool) -> None:
-        """The live source was lost, or could not be opened again: said once, counted each time."""
-        self._metrics.source_lost(problem)
+    def source_lost(self, camera_id: str, problem: SourceProblem, text: str, begins: bool) -> None:
+        """A live source was lost, or could not be opened again: counted each time, logged once."""
+        self._metrics.source_open.set(0)
+        self._metrics.source_losses.labels(problem).inc()
         if begins:
-            self._log.warning("source lost", reason=str(problem), problem=text)
+            log.warning("source lost", camera=camera_id, reason=str(problem), problem=text)
 
     def source_frames(self, taken: int, dropped: int) -> None:
-        """So many more frames of the live source were taken over, or dropped before coding."""
-        self._metrics.source_frames(taken, dropped)
-
-    def feed_heard(self, fixes: int) -> None:
-        """So many more fixes of the pose feed are used."""
-        self._metrics.feed_heard(fixes)
+        """So many more frames of live sources were taken over, or dropped before coding."""
+        self._metrics.source_frames.labels("taken").inc(taken)
+        self._metrics.source_frames.labels("dropped").inc(dropped)
 
     def _log_pose(self, result: FrameResult) -> None:
-        """Log when the camera was found, or lost, and how late the feed is if that changed."""
+        """Log when the camera was found or lost, and how late the feed is if that changed."""
         fix = None if result.encoded is None else result.encoded.fix
         if fix is None:
             return
         if fix.state is not self._pose_state:
             self._pose_state = fix.state
             log.info("pose", state=str(fix.state), picture=result.capture.picture.name)
-        offset_s, told_s = fix.feed_offset_s, self._feed_offset_s
-        if offset_s is None or (told_s is not None and abs(offset_s - told_s) < TOLD_OFFSET_S):
+        offset_s, logged_s = fix.feed_offset_s, self._feed_offset_s
+        if offset_s is None or (
+            logged_s is not None and abs(offset_s - logged_s) < LOGGED_OFFSET_S
+        ):
             return
         self._feed_offset_s = offset_s
         log.info("pose feed's time offset", seconds=round(offset_s, 3))
@@ -208,7 +201,7 @@ def log_line(result: FrameResult) -> dict[str, Any]:
     return {
         "name": result.capture.picture.name,
         "index": result.capture.index,
-        "camera": result.capture.camera_id or None,
+        "camera": result.capture.camera_id,
         "instant": result.capture.instant or None,
         "capture_time_ns": result.capture.capture_time_ns,
         "capture_clock": result.capture.clock and str(result.capture.clock),

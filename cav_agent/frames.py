@@ -28,88 +28,73 @@ __all__ = [
     "FrameResult",
     "Outcome",
     "RetryReason",
-    "RigPose",
     "StreamEnd",
 ]
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A picture a camera has taken; pixels are read when it is encoded.
+    """A picture that a camera has taken; pixels are read when it is encoded."""
 
-    Of a live camera ``clock`` says what ``captured_s`` rests on, and ``received_s`` when the agent
-    had the picture.
-    """
-
+    camera_id: str
     index: int
+    """The picture's place on the drive."""
     picture: PosedPicture
     captured_s: float
     capture_time_ns: int
     clock: ClockKind | None = None
+    """What the time of capture of a live camera rests on."""
     received_s: float | None = None
-    camera_id: str = ""
-    """Of a rig; empty: the vehicle's only camera."""
+    """When the agent had the picture of a live camera."""
     instant: int = 0
-    """Pictures of a rig with the same number were taken together; 0: it stands alone."""
+    """Pictures of a rig with the same number were taken together; 0: the camera is alone."""
     world_from_rig: Pose | None = None
-    """Of a rig's drive, rounded as it is sent."""
+    """Where a recorded drive has the rig, rounded as it is sent."""
 
 
 @dataclass(frozen=True)
 class EncodeJob:
-    """Code ``capture`` in ``epoch``; a new epoch numbers its packets afresh.
-
-    ``base`` is the frame it may be predicted from; ``None``: nothing but the render. ``exact``:
-    whether the server's renders are ours to the bit. ``budget``: the bytes it may take; ``None``:
-    the configured CRF. ``connection`` counts the streams the session has opened.
-    ``started_s``: when it was taken to be coded.
-    """
+    """Code ``capture`` in ``epoch``; a new epoch numbers its packets afresh."""
 
     capture: Capture
     epoch: int
     connection: int
+    """Counts the streams that the session has opened."""
     base: FrameAddress | None = None
+    """The frame it may be predicted from; ``None``: nothing but the render."""
     exact: bool = True
+    """Whether the server's renders are the vehicle's to the bit."""
     budget: ByteBudget | None = None
+    """The bytes it may take; ``None``: the configured CRF."""
     started_s: float = 0.0
-
-
-@dataclass(frozen=True)
-class RigPose:
-    """Where a rig was when a picture was taken, rounded as it is sent; ``None``: it is lost.
-
-    ``state``: how it was found in the field, if it is looked for there.
-    """
-
-    world_from_rig: Pose | None
-    state: LocalisationState | None = None
+    """When it was taken to be coded."""
 
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """A coded picture and what coding it took.
-
-    ``stage_s``: seconds by stage (convert, render, or track if poses are found, references, encode,
-    closed_loop). ``tries``: how often it was coded to fit the payload's limit. ``rung``, ``crf``:
-    the setting it was coded with. ``pose``: the one it was coded at; ``None``: the measured one.
-    ``read_s``: seconds it took to load the picture from the dataset. A vehicle's camera hands its
-    pictures over, so this is no stage of the sender and part of no delay. ``fix``: how its pose was
-    found in the field, where that is done. ``waited_s``: of a live camera, from its arrival until
-    it was taken to be coded. ``field_id``: the field it was coded against; empty: Hello's first.
-    ``world_from_rig``: of a rig's camera, the pose to send.
-    """
+    """A coded picture and what coding it took."""
 
     packet: DeltaPacket
     stage_s: Mapping[str, float]
+    """Seconds by stage: convert, render (track, if poses are found), references, encode,
+    closed_loop."""
+    pose: Pose | None
+    """The pose to send: the camera's, or its rig's; ``None`` while the camera is lost."""
+    pose_state: LocalisationState | None = None
+    """How the pose was found in the field, where that is done."""
+    fix: PoseEstimate | None = None
+    """What the camera's tracker found, where this camera is tracked."""
     tries: int = 1
+    """How often it was coded to fit the payload's limit."""
     rung: Rung = FULL_RUNG
     crf: float | None = None
-    pose: Pose | None = None
     read_s: float = 0.0
-    fix: PoseEstimate | None = None
+    """Seconds it took to load the picture from a dataset. A vehicle's camera hands its pictures
+    over, so this is no stage of the sender and part of no delay."""
     waited_s: float = 0.0
+    """Seconds from the arrival of a live camera's picture until it was taken to be coded."""
     field_id: str = ""
-    world_from_rig: RigPose | None = None
+    """The field it was coded against; empty: Hello's first."""
 
     @property
     def sender_s(self) -> float:
@@ -127,7 +112,7 @@ class Outcome(StrEnum):
 
 
 class EndReason(StrEnum):
-    """Why a picture, or a stream, ended as it did: a closed set, fit for a metric's label.
+    """Why a picture or a stream ended: a closed set, fit for a metric's label.
 
     A refused frame has the server's ``RejectReason`` instead. Numbers and messages belong into the
     ``problem`` beside the reason.
@@ -184,25 +169,25 @@ class StreamEnd:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """The end of one captured picture; ``encoded`` and times are there as far as the frame got.
-
-    ``reason`` is a word that can be counted, ``problem`` says more. ``packet_bytes``: the whole
-    message as sent. ``latency_s``: from capture to answer; ``link_s``: from sending to answer
-    without the server's own time. ``session_id``: the stream it was encoded for.
-    """
+    """The end of one captured picture; ``encoded`` and times are there as far as the frame got."""
 
     capture: Capture
     outcome: Outcome
     reason: EndReason | RejectReason = EndReason.NONE
     problem: str = ""
+    """What happened, in words."""
     encoded: EncodedFrame | None = None
     packet_bytes: int = 0
+    """The whole message as sent."""
     budget: ByteBudget | None = None
     session_id: str = ""
+    """The stream it was encoded for."""
     server: StageTimes | None = None
     server_digest: bytes = b""
     latency_s: float | None = None
+    """From capture to answer."""
     link_s: float | None = None
+    """From sending to answer, without the server's own time."""
 
     @property
     def packet(self) -> DeltaPacket | None:
@@ -213,7 +198,8 @@ class FrameResult:
     def stage_s(self) -> dict[str, float]:
         """Seconds by stage, with ``read`` for loading the picture; empty if it was not encoded.
 
-        Of a live camera, with ``receive`` from capture to arrival, ``wait`` from there to coding.
+        A live camera's picture also has ``receive``, from capture to arrival, and ``wait``, from
+        there to coding.
         """
         if self.encoded is None:
             return {}

@@ -8,8 +8,7 @@ be open: the assigned one, those of the next moments, so that the first picture 
 stream open, and a neighbour once the assigned server has been lost for a while. A picture that no
 server can take stays with its assigned tile, where the newest wins.
 
-A state machine without clock, sockets or tasks. Positions are (east, north) in metres, in the
-drive's own global frame.
+A state machine without clock, sockets or tasks.
 """
 
 from __future__ import annotations
@@ -18,18 +17,17 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from cav_agent.cameras import Position
 from rfcore.errors import InvalidInput
 from rfcore.wire.tiles import Tile
 
 __all__ = ["LEAVE_SHARE", "LOST_AFTER_S", "Handover", "HandoverCause", "ServedTile", "TileRoute"]
 
 LEAVE_SHARE = 0.25
-"""Of a tile's margin, how far a vehicle drives into it before another tile takes over."""
+"""Share of a tile's margin that a vehicle drives into before another tile takes over."""
 
 LOST_AFTER_S = 1.0
 """A server that is silent for so long is replaced by a neighbour; a shorter pause is waited for."""
-
-Position = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ class Handover:
         self.current: ServedTile | None = None
         """The tile that took the last picture."""
         self.draining: frozenset[ServedTile] = frozenset()
-        """The tiles whose servers ask to be left; they take pictures until others do."""
+        """The tiles whose servers are draining; they take pictures until others do."""
         self._near = near
         self._absent_since_s: float | None = None
 

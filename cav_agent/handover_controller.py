@@ -1,9 +1,14 @@
 """The drive itself: captures pictures in time and gives each to the stream of its tile.
 
 One loop asks ``cav_agent.capture_schedule`` which picture is due and ``cav_agent.handover`` which
-tile takes it, opens the next tile's stream before it is needed and closes the last one's when it is
-not. The next tile's field is fetched while the present one is in use, and stays prepared while its
-tile lies ahead.
+tile takes it. It opens the next tile's stream before it is needed, and closes the last one's when
+it is not needed any more. The next tile's field is fetched while the present one is in use, and
+stays prepared while its tile lies ahead.
+
+``TileStream`` is one tile on the vehicle's way: its field prepared, and a stream to its server
+while that is wanted. A stream that is closed first finishes what it has taken. Where the server is
+draining, a second stream to the same address is opened beside the first: a proxy places it on
+another server, which takes over as soon as it has welcomed the vehicle.
 """
 
 from __future__ import annotations
@@ -12,22 +17,24 @@ import asyncio
 import math
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
 
 import structlog
 
-from cav_agent.capture_schedule import CaptureSchedule, Lockstep, Realtime
-from cav_agent.client import CameraTaken, FieldNotServed
+from cav_agent.backoff import Backoff
+from cav_agent.cameras import Position
+from cav_agent.capture_schedule import CaptureSchedule
+from cav_agent.client import CameraTaken, FieldNotServed, StreamClient, StreamOwner
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.frame_log import DriveObserver
 from cav_agent.frames import FrameResult, RetryReason
-from cav_agent.handover import LOST_AFTER_S, Handover, Position, ServedTile, TileRoute
-from cav_agent.tile_stream import PrepareStream, TileStream
+from cav_agent.handover import LOST_AFTER_S, Handover, ServedTile, TileRoute
 from rfcore.errors import ProtocolError, RfedgeError
-from rfcore.wire.notices import StreetNotice
 
-__all__ = ["HandoverController"]
+__all__ = ["HandoverController", "OpenStream", "PrepareStream", "TileStream"]
 
 log = structlog.get_logger()
 
@@ -39,35 +46,45 @@ AHEAD_S, AHEAD_PICTURES = 30.0, 30
 
 SHORTEST_REST_S = 0.001
 POLL_S = 0.25
-"""A stream that opens or breaks between two pictures is noticed within this time."""
+"""A stream that breaks between two pictures is noticed within this time."""
+
+FIRST_RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
+"""Until a stream that failed is opened again: longer with every failure in a row."""
+
+OpenStream = Callable[[StreamOwner], StreamClient]
+"""Returns a client for a new stream to a tile that was prepared."""
+
+PrepareStream = Callable[[ServedTile], Awaitable[OpenStream]]
+"""Fetches and opens a tile's field; returns how to open streams with it."""
 
 
 class HandoverController:
     """Drives along ``positions`` across the tiles that ``tiles_published`` names.
 
-    It is the ``StreamObserver`` of every stream: each result passes here once, is counted, and goes
-    on to the schedule and to ``observer``.
+    It owns every stream: each result passes here once, is counted, and goes on to ``schedule`` and
+    ``observer``. ``changed`` is set by whoever has something new for its loop, such as a picture.
     """
 
     def __init__(
         self,
         config: AgentConfig,
         positions: Sequence[Position],
+        schedule: CaptureSchedule,
         prepare: PrepareStream,
         observer: DriveObserver,
-        schedule: CaptureSchedule | None = None,
+        changed: asyncio.Event,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._config = config
         self._positions = tuple(positions)
+        self._schedule = schedule
         self._prepare = prepare
         self._observer = observer
-        self._schedule = schedule or _schedule(config, len(positions))
+        self._changed = changed
         self._tiles: dict[int, tuple[ServedTile, ...]] = {}
         self._streams: dict[ServedTile, TileStream] = {}
         self._handover: Handover | None = None
         self._next = 0
-        self._changed = asyncio.Event()
         self._stopping = False
         self._was_welcomed = False
         self._failed: RfedgeError | None = None
@@ -84,10 +101,6 @@ class HandoverController:
             self._handover = Handover(route, self._pictures(NEAR_S, NEAR_PICTURES))
         else:
             self._handover.follow(route)
-        self._changed.set()
-
-    def picture_arrived(self) -> None:
-        """Look at the schedule: a live camera has a new picture, or has ended."""
         self._changed.set()
 
     def stop(self) -> None:
@@ -131,22 +144,10 @@ class HandoverController:
             self._failed = error
         self._changed.set()
 
-    def connected(self, is_connected: bool) -> None:
-        """Pass on that a server welcomed the vehicle, or that its stream was lost."""
-        self._was_welcomed = self._was_welcomed or is_connected
-        self._observer.connected(is_connected)
-
-    def retrying(self, reason: RetryReason) -> None:
-        """Pass on that something is tried again."""
-        self._observer.retrying(reason)
-
-    def noticed(self, notice: StreetNotice) -> None:
-        """Pass on what a server tells of the street."""
-        self._observer.noticed(notice)
-
-    def message_unknown(self) -> None:
-        """Pass on that a server sent something unknown."""
-        self._observer.message_unknown()
+    def welcomed(self) -> None:
+        """Note that a server has welcomed the vehicle."""
+        self._was_welcomed = True
+        self._changed.set()
 
     # --- pictures
 
@@ -170,9 +171,10 @@ class HandoverController:
             if before in self._streams and before is not None:
                 self._streams[before].withdraw()
                 self._streams[before].close()  # or its server would go on showing the vehicle
-        stream = self._stream(served)
-        self._schedule.limit(0.0 if stream.client is None else stream.client.rate_limit_hz)
-        stream.capture(index)
+        client = self._stream(served).client
+        self._schedule.limit(0.0 if client is None else client.rate_limit_hz)
+        if client is not None:
+            client.capture(index)
         self._next = index + 1
 
     # --- streams
@@ -180,7 +182,7 @@ class HandoverController:
     def _hold_streams(self, handover: Handover, now: float) -> None:
         """Open what is wanted, prepare what lies ahead, and close the rest."""
         streams = self._streams.items()
-        handover.draining = frozenset(tile for tile, stream in streams if stream.is_sent_away)
+        handover.draining = frozenset(tile for tile, stream in streams if stream.is_draining)
         wanted = handover.wanted(self._next, self._streaming(), now)
         ahead = handover.route.ahead(self._next, self._pictures(AHEAD_S, AHEAD_PICTURES))
         for served in wanted:
@@ -196,7 +198,7 @@ class HandoverController:
 
     def _stream(self, served: ServedTile) -> TileStream:
         if served not in self._streams:
-            self._streams[served] = TileStream(served, self._prepare, self)
+            self._streams[served] = TileStream(served, self._prepare, self, self._changed)
         return self._streams[served]
 
     def _streaming(self) -> frozenset[ServedTile]:
@@ -268,7 +270,153 @@ def _retry_reason(error: BaseException) -> RetryReason:
     return RetryReason.REFUSED if isinstance(error, ProtocolError) else RetryReason.FIELD
 
 
-def _schedule(config: AgentConfig, pictures: int) -> CaptureSchedule:
-    if config.pace is PaceKind.LOCKSTEP:
-        return Lockstep(pictures, loop=config.loop)
-    return Realtime(pictures, config.rate, loop=config.loop)
+@dataclass(frozen=True)
+class RunningClient:
+    """A client and the task in which it runs."""
+
+    client: StreamClient
+    task: asyncio.Task[None]
+
+
+class TileStream:
+    """A tile's stream: prepared, open, or closed; ``retry_at_s`` holds both back after an error."""
+
+    def __init__(
+        self,
+        served: ServedTile,
+        prepare: PrepareStream,
+        owner: StreamOwner,
+        changed: asyncio.Event,
+    ) -> None:
+        self.served = served
+        self.retry_at_s = 0.0
+        self._prepare = prepare
+        self._owner = owner
+        self._changed = changed
+        self._open: OpenStream | None = None
+        self._preparing: asyncio.Task[OpenStream] | None = None
+        self._current: RunningClient | None = None
+        self._successor: RunningClient | None = None
+        self._closing: list[RunningClient] = []
+        self._backoff = Backoff(FIRST_RETRY_S, LONGEST_RETRY_S)
+
+    @property
+    def client(self) -> StreamClient | None:
+        """The client that takes pictures; None while none is open, or the last one is closing."""
+        return None if self._current is None else self._current.client
+
+    @property
+    def is_streaming(self) -> bool:
+        """Whether the server has welcomed the vehicle and takes pictures."""
+        return self.client is not None and self.client.is_streaming
+
+    @property
+    def is_draining(self) -> bool:
+        """Whether the server is draining: it takes pictures until another one does."""
+        return self.client is not None and self.client.is_draining
+
+    @property
+    def tasks(self) -> list[asyncio.Task[OpenStream] | asyncio.Task[None]]:
+        """The tasks that have not been collected."""
+        preparing = [] if self._preparing is None else [self._preparing]
+        return [*preparing, *(running.task for running in self._running())]
+
+    def prepare(self, now: float) -> None:
+        """Begin to fetch and open the field, unless that is done or going on."""
+        if self._open is None and self._preparing is None and now >= self.retry_at_s:
+            self._preparing = asyncio.create_task(self._run_prepare())
+            self._preparing.add_done_callback(self._task_ended)
+
+    def open(self, now: float) -> None:
+        """Hold a stream to the server, as soon as the field is prepared."""
+        self.prepare(now)
+        if self._open is None or now < self.retry_at_s:
+            return
+        if self._closing:
+            return
+        if self._current is None:
+            self._current = self._run(self._open)
+        elif self.is_draining and self._successor is None:
+            self._successor = self._run(self._open)
+
+    def close(self) -> None:
+        """Finish what was taken, then close the stream."""
+        self._closing = self._running()
+        self._current = self._successor = None
+        for running in self._closing:
+            running.client.finish()
+
+    def stop(self) -> None:
+        """Finish the frame in flight, drop what waits, then close the stream."""
+        for running in self._running():
+            running.client.stop()
+        self.close()
+
+    def withdraw(self) -> None:
+        """Let a picture go that waits for a server which does not answer: another takes over."""
+        if self.client is not None and not self.client.is_streaming:
+            self.client.withdraw()
+
+    async def wait_closed(self) -> None:
+        """Wait until the stream has ended; raise the error with which it did."""
+        for running in self._running():
+            await running.task
+
+    def hold_back(self, now: float) -> float:
+        """Try nothing for a while, since something failed; return for how many seconds."""
+        pause_s = self._backoff.next_s()
+        self.retry_at_s = now + pause_s
+        return pause_s
+
+    def collect(self) -> BaseException | None:
+        """Note the tasks that ended; return the error with which one did."""
+        if self.is_streaming:
+            self._backoff.reset()
+        ended: list[asyncio.Task[OpenStream] | asyncio.Task[None]] = []
+        if self._preparing is not None and self._preparing.done():
+            ended.append(self._preparing)
+            self._preparing = None
+        for running in self._running():
+            if running.task.done():
+                running.client.abandon("its stream was given up")
+                ended.append(running.task)
+                self._forget(running)
+        self._take_over()
+        errors = (task.exception() for task in ended)
+        return next((error for error in errors if error is not None), None)
+
+    def _take_over(self) -> None:
+        """Give the pictures to the successor once its server has welcomed the vehicle, or once the
+        first stream has ended."""
+        current, successor = self._current, self._successor
+        if successor is None or not (successor.client.is_streaming or current is None):
+            return
+        if current is not None:
+            current.client.finish()
+            self._closing.append(current)
+        self._current, self._successor = successor, None
+
+    def _running(self) -> list[RunningClient]:
+        open_clients = (self._current, self._successor)
+        return [*self._closing, *(running for running in open_clients if running is not None)]
+
+    def _forget(self, ended: RunningClient) -> None:
+        if ended is self._current:
+            self._current = None
+        elif ended is self._successor:
+            self._successor = None
+        else:
+            self._closing.remove(ended)
+
+    def _run(self, open_stream: OpenStream) -> RunningClient:
+        client = open_stream(self._owner)
+        running = RunningClient(client, asyncio.create_task(client.run()))
+        running.task.add_done_callback(self._task_ended)
+        return running
+
+    def _task_ended(self, _: asyncio.Task[Any]) -> None:
+        self._changed.set()
+
+    async def _run_prepare(self) -> OpenStream:
+        self._open = await self._prepare(self.served)
+        return self._open

@@ -2,58 +2,54 @@
 
 An agent is one vehicle and one target of Prometheus, so ``instance`` tells vehicles apart. Their
 names appear only in ``rfedge_agent_info``, and only when asked for. Values of labels come from
-closed sets (enumerations, stages, references), but for the ids of fields.
+closed sets (enumerations, stages, references), except for the ids of fields.
 """
 
 from __future__ import annotations
 
 from prometheus_client import CollectorRegistry
 
-from cav_agent.deadline import Step
 from cav_agent.frames import EncodedFrame, FrameResult, RetryReason
-from cav_agent.handover import HandoverCause
-from cav_agent.live.source import SourceProblem
 from cav_agent.pose_feed.fix import FeedProblem
 from rfcore.codec.references import references_name
 from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.wire.instruments import Instruments
-from rfcore.wire.notices import NOTICE_KINDS, StreetNotice
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.notices import NOTICE_KINDS
 
 __all__ = ["AgentMetrics"]
 
 
 class AgentMetrics:
-    """Counters and histograms on a registry of their own."""
+    """Counters, gauges and histograms on one registry."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self.instruments = make = Instruments(registry)
         make.process()
         make.devices()
-        self._connected = make.gauge(
+        self.connected = make.gauge(
             "rfedge_agent_connected", "1 while the server has welcomed this vehicle."
         )
-        self._lost = make.counter(
+        self.connections_lost = make.counter(
             "rfedge_agent_connections_lost", "Streams that ended before the drive did."
         )
-        self._retries = make.counter(
+        self.retries = make.counter(
             "rfedge_agent_retries",
             "What failed and is tried again: stream, refused, field_gone, field, tiles.",
             ("reason",),
         )
         for reason in RetryReason:
-            self._retries.labels(reason)
-        self._unknown = make.counter(
+            self.retries.labels(reason)
+        self.unknown_messages = make.counter(
             "rfedge_agent_unknown_messages",
             "Messages of a newer server that this agent does not know, and ignores.",
         )
-        self._notices = make.counter(
+        self.notices = make.counter(
             "rfedge_agent_notices",
             "Notices of the street that servers sent, by what they tell of: object, map, light.",
             ("kind",),
         )
         for kind in NOTICE_KINDS:
-            self._notices.labels(kind)
+            self.notices.labels(kind)
         self._frames = make.counter(
             "rfedge_agent_frames",
             "Captured pictures by result (acked, nacked, dropped, lost) and reason.",
@@ -107,16 +103,16 @@ class AgentMetrics:
             "Throughput that the last answers prove, minimum round-trip time counted as sending; "
             "0 without --max-delay-ms.",
         )
-        self._rung = make.gauge(
+        self.rung = make.gauge(
             "rfedge_agent_rung",
             "Rungs of the ladder above the present one: 0 is the best; without a deadline 0.",
         )
-        self._steps = make.counter(
+        self.rung_steps = make.counter(
             "rfedge_agent_rung_steps",
             "Changes of rung, down to a faster one or up to a better one.",
             ("direction",),
         )
-        self._late = make.counter(
+        self.deadline_missed = make.counter(
             "rfedge_agent_deadline_missed_frames",
             "Frames that took longer than --deadline-ms from the picture to the packet.",
         )
@@ -129,67 +125,49 @@ class AgentMetrics:
             "rfedge_agent_capture_to_ack_seconds",
             "From the picture in the camera to its Ack.",
         )
-
-        self._fields = make.gauge(
+        self.field_info = make.gauge(
             "rfedge_agent_field_info",
             "1; a radiance field that is ready: the first 16 digits of its id, and its kind.",
             ("field", "kind"),
         )
-        self._handovers = make.counter(
+        self.handovers = make.counter(
             "rfedge_agent_handovers",
             "Moves to another server or tile: tile (by position or version), server_lost.",
             ("cause",),
         )
-
-        self._source = make.gauge(
+        self.source_open = make.gauge(
             "rfedge_agent_source_open",
             "1 while frames of the live source come; only with --source.",
         )
-        self._capture_clock = make.gauge(
+        self.capture_clock = make.gauge(
             "rfedge_agent_capture_clock",
             "1 for what the live source's times of capture rest on: sender_report, arrival.",
             ("clock",),
         )
-        self._source_frames = make.counter(
+        self.source_frames = make.counter(
             "rfedge_agent_source_frames",
             "Frames of the live source by what became of them: taken over, or dropped because a "
             "newer one came first, the rate is lower, or their time went back.",
             ("result",),
         )
-        self._source_losses = make.counter(
+        self.source_losses = make.counter(
             "rfedge_agent_source_losses",
             "Times that the live source was lost or did not open: ended, silent, wrong_size.",
             ("reason",),
         )
-        self._field_bytes = make.counter(
+        self.field_bytes = make.counter(
             "rfedge_agent_field_bytes", "Bytes of field archives and layers that were fetched."
         )
-        self._fixes = make.counter(
+        self.feed_fixes = make.counter(
             "rfedge_agent_pose_feed_fixes", "Poses of the vehicle's own sensors that are used."
         )
-        self._feed_problems = make.counter(
+        self.feed_problems = make.counter(
             "rfedge_agent_pose_feed_problems",
             "What was wrong with the pose feed, by reason; the log tells each once.",
             ("reason",),
         )
         for problem in FeedProblem:
-            self._feed_problems.labels(problem)
-
-    def noticed(self, notice: StreetNotice) -> None:
-        """Count a notice of the street."""
-        self._notices.labels(notice.kind).inc()
-
-    def field_fetched(self, size_bytes: int) -> None:
-        """Count the bytes of an archive that was fetched."""
-        self._field_bytes.inc(size_bytes)
-
-    def feed_heard(self, fixes: int) -> None:
-        """Count poses of the vehicle's own sensors."""
-        self._fixes.inc(fixes)
-
-    def feed_problem(self, problem: FeedProblem) -> None:
-        """Count something wrong with the pose feed."""
-        self._feed_problems.labels(str(problem)).inc()
+            self.feed_problems.labels(problem)
 
     def identify(self, vehicle_id: str, camera_id: str) -> None:
         """Export the names of vehicle and camera, for operators who want them."""
@@ -198,52 +176,6 @@ class AgentMetrics:
             "1; the vehicle and its camera. Only with --metrics-per-vehicle.",
             {"vehicle": vehicle_id, "camera": camera_id},
         )
-
-    def field_ready(self, field_id: str, kind: str) -> None:
-        """Note a field that was made ready to code frames against."""
-        self._fields.labels(field_id[:16], kind).set(1)
-
-    def handed_over(self, cause: HandoverCause) -> None:
-        """Count a handover."""
-        self._handovers.labels(cause).inc()
-
-    def coded_under_deadline(self, position: int, step: Step | None, late: bool) -> None:
-        """Note the rung after a frame under a deadline, and whether the frame kept it."""
-        self._rung.set(position)
-        if step is not None:
-            self._steps.labels("down" if step.down else "up").inc()
-        if late:
-            self._late.inc()
-
-    def connected(self, is_connected: bool) -> None:
-        """Note that a server welcomed the vehicle, or that its stream was lost."""
-        self._connected.set(is_connected)
-        if not is_connected:
-            self._lost.inc()
-
-    def source_open(self, clock: ClockKind) -> None:
-        """Note that frames of the live source come, and what their times rest on."""
-        self._source.set(1)
-        for kind in ClockKind:
-            self._capture_clock.labels(kind).set(kind is clock)
-
-    def source_lost(self, problem: SourceProblem) -> None:
-        """Count a loss of the live source."""
-        self._source.set(0)
-        self._source_losses.labels(problem).inc()
-
-    def source_frames(self, taken: int, dropped: int) -> None:
-        """Count frames of the live source."""
-        self._source_frames.labels("taken").inc(taken)
-        self._source_frames.labels("dropped").inc(dropped)
-
-    def retrying(self, reason: RetryReason) -> None:
-        """Count something that failed and is tried again."""
-        self._retries.labels(reason).inc()
-
-    def message_unknown(self) -> None:
-        """Count a message that is ignored."""
-        self._unknown.inc()
 
     def ended(self, result: FrameResult) -> None:
         """Count a picture that came to its end."""

@@ -84,7 +84,7 @@ class NoticeSocket:
         with suppress(FileNotFoundError):
             self._path.unlink()
 
-    def tell(self, notice: StreetNotice) -> None:
+    def send(self, notice: StreetNotice) -> None:
         """Write a notice to every reader."""
         line = json.dumps(notice_line(notice, time.time_ns())).encode() + b"\n"
         for reader in tuple(self._readers):

@@ -1,4 +1,4 @@
-"""How many bytes the next frame may have, so that its answer comes within a delay. No clock.
+"""How many bytes the next frame may have, so that its answer comes within a delay.
 
 The delay runs from capture to Ack, as ``rfedge_agent_capture_to_ack_seconds`` measures it: waiting,
 rendering, coding, the uplink, the server's work and the downlink. Quality falls first: a frame gets
@@ -10,18 +10,28 @@ coded.
 The frames of a rig's instant count as one packet on the path: sent when the first of them was,
 answered with the last, less the time for which none was on its way because the next was being
 coded. One frame of a camera among several is too short to tell the path's rate from its jitter.
+
+``BitDivision`` divides the bytes of an instant among the cameras of a rig, so that quality is even.
+A slice of complexity c takes about c 2^(-CRF / 6) bytes. So all cameras come out at one CRF when
+each gets bytes in proportion to its complexity, which is learnt from its coded frames. Motion, a
+field that shows something else than the camera sees, and a mask that is coded finer make slices
+longer at the same CRF: they are in the complexity. The shares sum to the budget, and none is below
+``LEAST_CAMERA_SHARE`` of an even share: a camera that shows little now is ready for what comes.
+
+No clock is read: ``now`` is an argument.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+import math
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from cav_agent.path_estimator import PathEstimator
 from rfcore.errors import InvalidInput
 from rfcore.wire.messages import FrameAddress
 
-__all__ = ["ByteBudget", "QualitySteps", "RateControl"]
+__all__ = ["LEAST_CAMERA_SHARE", "BitDivision", "ByteBudget", "QualitySteps", "RateControl"]
 
 SHARE = 0.75
 """Share of the delay that is aimed at; the rest is a margin for frames, path and machine."""
@@ -47,6 +57,12 @@ LEAST_SHARE = 0.1
 MEMORY = 0.75
 """Weight of what was known in the running means."""
 
+LEAST_CAMERA_SHARE = 0.25
+"""Part of an even share that every camera of a rig gets at least."""
+
+HALVING_CRF = 6.0
+"""CRF that halves a slice (4 of CRF change the bits of a street by 60 %)."""
+
 OVERHEAD_BYTES = 150
 """Pose, digests, gRPC and HTTP/2 framing around a slice: assumed until one was sent."""
 
@@ -71,7 +87,7 @@ class ByteBudget:
 
 
 @dataclass
-class InstantOnPath:
+class InstantInFlight:
     """The frames of an instant that are ``unsent`` or ``unanswered``; times in seconds."""
 
     unsent: int
@@ -86,8 +102,7 @@ class InstantOnPath:
 
 
 class RateControl:
-    """Keeps frames within ``max_delay_s`` from capture to Ack: of a camera, or of a rig's instants
-    together."""
+    """Keeps frames, or a rig's instants, within ``max_delay_s`` from capture to Ack."""
 
     def __init__(self, max_delay_s: float) -> None:
         if not 0.01 <= max_delay_s <= 60:
@@ -100,7 +115,7 @@ class RateControl:
         self._overhead_bytes = float(OVERHEAD_BYTES)
         self._interval_s: float | None = None
         self._captured_s: float | None = None
-        self._instants: dict[Hashable, InstantOnPath] = {}
+        self._instants: dict[Hashable, InstantInFlight] = {}
         self._instant_of: dict[FrameAddress, Hashable] = {}
 
     @property
@@ -157,12 +172,12 @@ class RateControl:
             self._path.lost(key)
             del self._instants[key]
         if instant:
-            self._instants[instant] = InstantOnPath(pictures)
+            self._instants[instant] = InstantInFlight(pictures)
 
     def sent(self, address: FrameAddress, packet_bytes: int, now: float, instant: int = 0) -> None:
         """A frame was sent, of a rig's ``instant`` or of a camera that stands alone."""
         key: Hashable = instant or address
-        frames = self._instants.setdefault(key, InstantOnPath(1))
+        frames = self._instants.setdefault(key, InstantInFlight(1))
         if frames.unanswered:
             self._path.grew(key, packet_bytes, 0)
         elif frames.answered_s is not None:
@@ -202,7 +217,7 @@ class RateControl:
         self._path.lost(key)
         self._close(key, frames)
 
-    def _close(self, key: Hashable, frames: InstantOnPath) -> None:
+    def _close(self, key: Hashable, frames: InstantInFlight) -> None:
         """Learn of the path from an instant that is over."""
         if not frames.is_over:
             return
@@ -218,6 +233,41 @@ class RateControl:
         elif now - latency_s >= self._cut_s:
             self._share = max(LEAST_SHARE, SHRINK * self._share)
             self._cut_s = now
+
+
+class BitDivision:
+    """Divides bytes among cameras by complexity, weighed by ``priorities``.
+
+    A camera of priority 2 gets twice the bytes of one like it.
+    """
+
+    def __init__(self, priorities: Mapping[str, float]) -> None:
+        for camera_id, priority in priorities.items():
+            if not (math.isfinite(priority) and priority > 0):
+                raise InvalidInput("priority", f"{priority} of camera {camera_id} must be above 0")
+        self._priorities = dict(priorities)
+        self._complexity: dict[str, float] = {}
+
+    def coded(self, camera_id: str, payload_bytes: int, crf: float) -> None:
+        """A frame of a camera took so many bytes at ``crf``."""
+        found = max(1, payload_bytes) * 2 ** (crf / HALVING_CRF)
+        self._complexity[camera_id] = _mean(self._complexity.get(camera_id), found)
+
+    def divide(self, total_bytes: float, camera_ids: Sequence[str]) -> dict[str, float]:
+        """Return the bytes of each camera; they sum to ``total_bytes``.
+
+        A camera of which nothing was coded yet counts as complex as the mean of the others.
+        """
+        known = [self._complexity[c] for c in camera_ids if c in self._complexity]
+        usual = sum(known) / len(known) if known else 1.0
+        weights = {
+            c: self._priorities.get(c, 1.0) * self._complexity.get(c, usual) for c in camera_ids
+        }
+        whole, least = sum(weights.values()), LEAST_CAMERA_SHARE / len(camera_ids)
+        return {
+            c: total_bytes * (least + (1 - LEAST_CAMERA_SHARE) * weight / whole)
+            for c, weight in weights.items()
+        }
 
 
 class QualitySteps:

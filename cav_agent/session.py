@@ -21,7 +21,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from cav_agent.bit_division import BitDivision
 from cav_agent.config import AgentLimits
 from cav_agent.frames import (
     Capture,
@@ -32,12 +31,9 @@ from cav_agent.frames import (
     Outcome,
     StreamEnd,
 )
-from cav_agent.frames_in_flight import FramesInFlight, PredictionChain
-from cav_agent.rate_control import ByteBudget, RateControl
-from cav_agent.waiting_instants import WaitingInstants
-from rfcore.camera import Pose
+from cav_agent.pending_frames import FramesInFlight, PredictionChain, WaitingInstants
+from cav_agent.rate_control import BitDivision, ByteBudget, RateControl
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
-from rfcore.localise.estimate import LocalisationState
 from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, MAX_PAYLOAD_BYTES
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import (
@@ -99,7 +95,7 @@ class AgentSession:
     ``rate_control`` says how many bytes each instant may take, and ``bit_division`` how its
     cameras share them; without the former all have the configured CRF. ``failed`` is set when the
     server refused the vehicle's Hello, ``broken`` when it did not answer in time; either ends the
-    stream. ``is_sent_away``: the server is about to stop, and goes on taking frames for a while.
+    stream. ``is_draining``: the server is about to stop, and goes on taking frames for a while.
     """
 
     def __init__(
@@ -114,12 +110,11 @@ class AgentSession:
         self.state = LinkState.DISCONNECTED
         self.session_id = ""
         self.exact: bool | None = None
-        self.is_sent_away = False
+        self.is_draining = False
         self.rate_limit_hz = 0.0
         self.failed: RfedgeError | None = None
         self.broken: StreamEnd | None = None
         self._hello = hello
-        self._first_camera_id = hello.cameras[0].camera_id
         self._limits = limits or AgentLimits()
         self._rate_control = rate_control
         self._bit_division = bit_division or BitDivision({})
@@ -128,9 +123,11 @@ class AgentSession:
             camera.camera_id: SendingCamera(PredictionChain(first_epoch))
             for camera in hello.cameras
         }
-        self._in_flight = FramesInFlight(self._limits.answer_s)
+        self._in_flight = FramesInFlight(self._limits)
         self._connection = 0
-        self._slot = WaitingInstants(self._limits.slot_frames, lambda c: self._of(c).may_send)
+        self._waiting = WaitingInstants(
+            self._limits.slot_frames, lambda c: self._cameras[c].may_send
+        )
         self._job: EncodeJob | None = None
         self._outbox: deque[OutgoingMessage] = deque()
         self._results: deque[FrameResult] = deque()
@@ -149,10 +146,7 @@ class AgentSession:
     @property
     def is_idle(self) -> bool:
         """Whether no picture waits, is being encoded or is unanswered."""
-        return not (self._slot or self._job or self._in_flight)
-
-    def _of(self, camera_id: str) -> SendingCamera:
-        return self._cameras[camera_id or self._first_camera_id]
+        return not (self._waiting or self._job or self._in_flight)
 
     # --- connection
 
@@ -160,7 +154,7 @@ class AgentSession:
         """A stream is open: greet the server."""
         self.state = LinkState.GREETING
         self.broken = None
-        self.is_sent_away = False
+        self.is_draining = False
         self._connection += 1
         for camera in self._cameras.values():
             camera.granted = camera.used = 0
@@ -180,7 +174,7 @@ class AgentSession:
 
     def abandon(self, end: StreamEnd, now: float) -> None:
         """End every picture that was taken: nobody will encode or send any more of them."""
-        for capture in self._slot.clear():
+        for capture in self._waiting.clear():
             self._results.append(FrameResult(capture, Outcome.LOST, end.reason, end.problem))
         if self._job is not None:
             capture = self._take_job().capture
@@ -204,7 +198,7 @@ class AgentSession:
             case Nack():
                 self._nacked(message, now)
             case DrainNotice():
-                self.is_sent_away = True
+                self.is_draining = True
             case FieldNotice() | StreetNotice() | Credit():
                 pass  # the refusal that follows a notice names both ids
 
@@ -214,7 +208,7 @@ class AgentSession:
             return
         packet = frame.result.packet
         if packet is not None and packet.reconstruction_digest == ack.reconstruction_digest:
-            self._of(ack.address.camera_id).chain.decoded(ack.address)
+            self._cameras[ack.address.camera_id].chain.decoded(ack.address)
         self._finish(ack.address, Outcome.ACKED, EndReason.NONE, "", now)
 
     def _nacked(self, nack: Nack, now: float) -> None:
@@ -235,25 +229,25 @@ class AgentSession:
         outcome = Outcome.LOST if overloaded else Outcome.NACKED
         for address, frame in self._in_flight.refused_by(nack):
             if nack.reason is RejectReason.UNKNOWN_STATE:
-                self._of(address.camera_id).chain.unknown_to_server(frame.base)
+                self._cameras[address.camera_id].chain.unknown_to_server(frame.base)
             self._finish(address, outcome, nack.reason, nack.problem, now)
 
     # --- pictures
 
     def offer(self, *captures: Capture) -> None:
         """Take the pictures of an instant; what waits longest is dropped when there is no room."""
-        self._drop(self._slot.offer(captures), EndReason.SUPERSEDED)
+        self._drop(self._waiting.offer(captures), EndReason.SUPERSEDED)
         if self._rate_control is not None:
             self._rate_control.captured(captures[0].captured_s)
 
     def withdraw(self) -> None:
         """Let go what waits for the encoder, to be captured again for another server."""
-        for capture in self._slot.clear():
+        for capture in self._waiting.clear():
             self._results.append(FrameResult(capture, Outcome.LOST, EndReason.HANDED_OVER))
 
     def stop(self) -> None:
         """Drop what waits for the encoder; what is being encoded or unanswered goes on."""
-        self._drop(self._slot.clear(), EndReason.STOPPING)
+        self._drop(self._waiting.clear(), EndReason.STOPPING)
 
     def _drop(self, captures: Iterable[Capture], reason: EndReason) -> None:
         self._results.extend(FrameResult(c, Outcome.DROPPED, reason) for c in captures)
@@ -262,12 +256,12 @@ class AgentSession:
         """Return the picture to encode now; None without picture, credit, free encoder or room."""
         ready = self.state is LinkState.STREAMING and self._job is None
         self._drop_late(now)
-        if not ready or not (self._slot.is_begun or self._begin_instant(now)):
+        if not ready or not (self._waiting.is_begun or self._begin_instant(now)):
             return None
-        capture = self._slot.next()
+        capture = self._waiting.next()
         if capture is None:
             return None
-        exact, chain = bool(self.exact), self._of(capture.camera_id).chain
+        exact, chain = bool(self.exact), self._cameras[capture.camera_id].chain
         base = chain.base if exact else None
         budget = self._budgets.get(capture.camera_id)
         self._job = EncodeJob(
@@ -284,7 +278,7 @@ class AgentSession:
 
     def _begin_instant(self, now: float) -> bool:
         """Begin the instant that waits and divide its bytes; return whether that could be done."""
-        captures = self._slot.startable()
+        captures = self._waiting.startable()
         if not captures:
             return False
         control = self._rate_control
@@ -297,15 +291,15 @@ class AgentSession:
             shares = self._bit_division.divide(budget.target_bytes, camera_ids)
             self._budgets = {c: budget.with_target(size) for c, size in shares.items()}
             control.begun(captures[0].instant, len(captures))
-        self._drop(self._slot.begin(), EndReason.SUPERSEDED)
+        self._drop(self._waiting.begin(), EndReason.SUPERSEDED)
         return True
 
     def _drop_late(self, now: float) -> None:
         control = self._rate_control
-        while control is not None and (waiting_s := self._slot.waiting_since_s) is not None:
+        while control is not None and (waiting_s := self._waiting.waiting_since_s) is not None:
             if not control.is_late(waiting_s, now):
                 return
-            self._drop(self._slot.drop_oldest(), EndReason.TOO_LATE)
+            self._drop(self._waiting.drop_oldest(), EndReason.TOO_LATE)
 
     def encoded(self, encoded: EncodedFrame, now: float) -> None:
         """The picture of the running job became ``encoded``: send it, if its stream still is."""
@@ -350,7 +344,7 @@ class AgentSession:
         """Return why the frame of ``job`` is not worth sending, or None."""
         if job.connection != self._connection or self.state is not LinkState.STREAMING:
             return EndReason.NOT_SENT, "the stream ended before it was sent"
-        if job.epoch != self._of(job.capture.camera_id).chain.epoch and job.base is not None:
+        if job.epoch != self._cameras[job.capture.camera_id].chain.epoch and job.base is not None:
             return EndReason.BASE_LOST, "the frame it needs was not decoded"
         return None
 
@@ -360,7 +354,7 @@ class AgentSession:
         result = FrameResult(capture, Outcome.DROPPED, EndReason.NOT_CODED, str(error))
         self._results.append(result)
         self._not_sent(capture.instant)
-        self._of(capture.camera_id).chain.restart()
+        self._cameras[capture.camera_id].chain.restart()
 
     def _not_sent(self, instant: int) -> None:
         if self._rate_control is not None:
@@ -374,14 +368,14 @@ class AgentSession:
 
     def _frame(self, capture: Capture, encoded: EncodedFrame) -> Frame:
         return Frame(
-            capture.camera_id or self._first_camera_id,
+            capture.camera_id,
             capture.capture_time_ns,
-            _pose_to_send(capture, encoded),
+            encoded.pose,
             bytes.fromhex(encoded.field_id)[:FIELD_ID_PREFIX_BYTES],
             encoded.packet,
             encoded.rung.quality,
             capture.clock,
-            _localisation(encoded),
+            encoded.pose_state,
             capture.instant,
         )
 
@@ -459,18 +453,3 @@ def _restart_after(nack: Nack, chain: PredictionChain) -> None:
     if nack.address.epoch < chain.epoch and nack.current_epoch <= chain.epoch:
         return
     chain.restart(nack.current_epoch)
-
-
-def _localisation(encoded: EncodedFrame) -> LocalisationState | None:
-    """Return how the frame's pose was found in the field, in its own picture or the reference's."""
-    found = encoded.fix or encoded.world_from_rig
-    return None if found is None else found.state
-
-
-def _pose_to_send(capture: Capture, encoded: EncodedFrame) -> Pose | None:
-    """Return the pose that a frame was coded at; ``None`` if the camera is lost."""
-    if encoded.world_from_rig is not None:
-        return encoded.world_from_rig.world_from_rig
-    if encoded.fix is not None:
-        return encoded.fix.world_from_cam
-    return encoded.pose or capture.picture.camera.world_from_cam

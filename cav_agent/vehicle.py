@@ -1,8 +1,9 @@
 """One vehicle put together: servers, fields, streams, metrics, and the drive that uses them.
 
-The path of a frame: ``capture_schedule`` says when a picture is due, ``handover_controller`` which
-tile's stream takes it, ``session`` when it is encoded, ``pipeline`` encodes it, ``client`` sends it
-and brings the answer back to the session, and the controller hears how it ended.
+The path of a frame: ``capture_schedule`` says when a picture is due and ``handover_controller``
+which tile's stream takes it from ``cameras``; ``session`` decides when it is encoded, ``pipeline``
+encodes it, ``client`` sends it and brings the answer back to the session, and the controller is
+told how it ended.
 """
 
 from __future__ import annotations
@@ -16,42 +17,46 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import structlog
 from prometheus_client import CollectorRegistry
 
 from cav_agent.backoff import Backoff
-from cav_agent.bit_division import BitDivision
-from cav_agent.capture_schedule import CaptureSchedule, Lockstep
-from cav_agent.client import CameraSource, StreamClient, StreamObserver
+from cav_agent.camera_poses import (
+    CameraPoses,
+    DatasetPoses,
+    KnownPoses,
+    MeasuredRigPoses,
+    PoseSource,
+    RecordedRigPoses,
+    RigCameraPoses,
+    RigPoses,
+    TrackedRigPoses,
+)
+from cav_agent.cameras import instant_numbers, recorded_cameras
+from cav_agent.capture_schedule import recorded_schedule
+from cav_agent.client import CameraSource, StreamClient, StreamOwner
 from cav_agent.config import AgentConfig, PaceKind
-from cav_agent.drive_pictures import OneCamera, VehiclePictures
-from cav_agent.field_cache import FieldCache, PreparedCamera, PreparedField, read_drive
-from cav_agent.frame_log import DriveObserver, FrameLog
+from cav_agent.field_cache import FieldCache, PreparedCamera, PreparedField
+from cav_agent.frame_log import DriveObserver
 from cav_agent.frames import EncodedFrame, EncodeJob, RetryReason
 from cav_agent.handover import ServedTile
-from cav_agent.handover_controller import HandoverController
-from cav_agent.live.camera import LiveCamera, TrajectoryPoses, open_camera
-from cav_agent.live.rig import LiveRig, open_rig
+from cav_agent.handover_controller import HandoverController, OpenStream
+from cav_agent.live_cameras import LiveCameras, open_live_cameras
 from cav_agent.metrics import AgentMetrics
 from cav_agent.notices import NoticeSocket
-from cav_agent.pipeline import OnRig, Pipeline, PipelineOptions, Tracking
-from cav_agent.pose_feed.feed import FieldFeed, PoseFeed
-from cav_agent.pose_feed.following import FollowedFeed
-from cav_agent.pose_feed.placing import Place
-from cav_agent.pose_feed.settings import SourceKind
-from cav_agent.pose_feed.sources import FeedTask
-from cav_agent.rate_control import RateControl
-from cav_agent.rig_poses import DrivenRig, MeasuredRig, RigPoses, TrackedRig
+from cav_agent.pipeline import Pipeline, PipelineOptions
+from cav_agent.pose_feed.feed import PoseFeed
+from cav_agent.pose_feed.feed_poses import FeedPoses
+from cav_agent.pose_feed.placement import FieldPlacement
+from cav_agent.pose_feed.sources import FeedKind, FeedTask
+from cav_agent.rate_control import BitDivision, RateControl
 from cav_agent.server_connection import WHOLE_STREET, ServerConnection, server_connections
 from cav_agent.session import AgentSession
-from cav_agent.tile_stream import OpenStream
 from rfcore.camera import TileOrigin
-from rfcore.dataset.rig import read_rig, read_rig_drive
+from rfcore.dataset.rig import Rig, read_rig
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField
 from rfcore.wire.checks import check_name
@@ -83,7 +88,7 @@ field was replaced, so it is asked for more often than a stream that was refused
 class Vehicle:
     """Runs ``config`` from connecting to the end of the drive; ``stop`` ends it early.
 
-    ``on_notice`` is called, on the event loop, with what servers tell of the street.
+    ``on_notice`` is called, on the event loop, with each notice that a server sends of the street.
     """
 
     def __init__(
@@ -95,8 +100,7 @@ class Vehicle:
         self._config = config
         self._metrics = AgentMetrics(self.registry)
         self._stopped = asyncio.Event()
-        self._live: LiveCamera | LiveRig | None = None
-        self._picture_arrived: Callable[[], None] = lambda: None
+        self._live: LiveCameras | None = None
 
     def stop(self) -> None:
         """Finish the frame in flight, then end."""
@@ -109,28 +113,31 @@ class Vehicle:
             self._metrics.identify(config.vehicle, config.camera)
         _serve_metrics(config.metrics, self.registry)
         with structlog.contextvars.bound_contextvars(vehicle=config.vehicle):
-            way = await asyncio.to_thread(_way, config)
             async with AsyncExitStack() as stack:
-                return await self._drive(await self._controller(stack, way))
+                return await self._drive(await self._controller(stack))
 
-    async def _controller(self, stack: AsyncExitStack, way: Way) -> HandoverController:
-        """Open what the drive along ``way`` needs; ``stack`` closes it."""
-        config = self._config
+    async def _controller(self, stack: AsyncExitStack) -> HandoverController:
+        """Open what the drive needs; ``stack`` closes it."""
+        config, changed = self._config, asyncio.Event()
+        rig = None if config.rig is None else _read_rig(config)
+        is_live = config.live.source is not None or (rig is not None and rig.is_live)
+        recorded = None
+        if not is_live:
+            recorded = await asyncio.to_thread(
+                recorded_cameras, config, TileOrigin(), instant_numbers(config)
+            )
         encoder = stack.enter_context(ThreadPoolExecutor(1, "encoder"))
         for server in self._servers:
             await stack.enter_async_context(server)
         frame_log = None
         if config.report is not None:
-            frame_log = FrameLog(config.report)
-            stack.callback(frame_log.close)
+            frame_log = stack.enter_context(config.report.open("w", buffering=1))
         addresses = [server.address for server in self._servers]
         takers = await self._notice_takers(stack)
         observer = DriveObserver(self._metrics, addresses, frame_log, takers)
-        live = self._live = await self._open_source(stack, observer)
-        pictures: VehiclePictures | None = live if isinstance(live, LiveRig) else None
-        if isinstance(live, LiveCamera):
-            pictures = OneCamera(config.camera, live.pictures, config.masking)
-        fields = FieldCache(config, self._servers, observer, pictures)
+        if is_live:
+            self._live = await self._open_live(stack, rig, observer, changed)
+        fields = FieldCache(config, self._servers, observer, self._live)
         stack.push_async_callback(fields.close)
         feed = await self._open_feed(stack, observer)
         searcher = stack.enter_context(
@@ -140,54 +147,45 @@ class Vehicle:
             config,
             self._servers,
             fields,
+            observer,
             encoder,
             searcher,
             feed,
-            live,
+            self._live,
             take_notices=bool(takers),
         )
-        if live is None:
-            return HandoverController(
-                config, way.positions, streams.prepare, observer, way.schedule
-            )
-        controller = HandoverController(
-            config, live.positions, streams.prepare, observer, live.schedule
-        )
-        self._picture_arrived = controller.picture_arrived
-        return controller
+        prepare = streams.prepare
+        if self._live is not None:
+            positions, live_schedule = self._live.positions, self._live.schedule
+            return HandoverController(config, positions, live_schedule, prepare, observer, changed)
+        assert recorded is not None
+        schedule = recorded_schedule(config, len(recorded), len(recorded.cameras))
+        return HandoverController(config, recorded.positions, schedule, prepare, observer, changed)
 
     async def _notice_takers(self, stack: AsyncExitStack) -> list[Callable[[StreetNotice], None]]:
-        """Return who takes notices; ``stack`` closes the socket, if there is one."""
+        """Return what is called with notices; ``stack`` closes the socket, if there is one."""
         takers = [] if self._on_notice is None else [self._on_notice]
         if self._config.notices is not None:
             notices = await stack.enter_async_context(NoticeSocket(self._config.notices))
-            takers.append(notices.tell)
+            takers.append(notices.send)
         return takers
 
-    async def _open_source(
-        self, stack: AsyncExitStack, observer: DriveObserver
-    ) -> LiveCamera | LiveRig | None:
-        """Begin to read the live cameras, if there are any; ``stack`` ends it."""
-        config, loop = self._config, asyncio.get_running_loop()
-        rig = None if config.rig is None else read_rig(config.rig)
-        if config.live.source is None and (rig is None or not rig.is_live):
-            return None
+    async def _open_live(
+        self,
+        stack: AsyncExitStack,
+        rig: Rig | None,
+        observer: DriveObserver,
+        changed: asyncio.Event,
+    ) -> LiveCameras:
+        """Begin to read the live cameras; ``stack`` ends it."""
+        loop = asyncio.get_running_loop()
 
         def arrived() -> None:
-            loop.call_soon_threadsafe(lambda: self._picture_arrived())
+            loop.call_soon_threadsafe(changed.set)
 
-        open_live = open_camera if rig is None else partial(open_rig, rig)
-        live: LiveCamera | LiveRig = await asyncio.to_thread(
-            open_live,
-            config.live,
-            config.rate,
-            observer,
-            has_feed=config.feed.source is not None,
-            repeats=config.loop,
-            arrived=arrived,
-        )
+        live = await asyncio.to_thread(open_live_cameras, self._config, rig, observer, arrived)
         stack.push_async_callback(asyncio.to_thread, live.close)
-        if config.neighbours and not live.knows_route:
+        if self._config.neighbours and not live.knows_route:
             raise RfedgeError(_NO_ROUTE)
         return live
 
@@ -200,10 +198,10 @@ class Vehicle:
         source = settings.source
         if source is None:
             return None
-        recorded = source.kind is SourceKind.FILE
+        recorded = source.kind is FeedKind.FILE
         offset_s = settings.feed_offset_s
         feed = PoseFeed(observer.feed_problem, offset_s=offset_s, recorded=recorded)
-        task = FeedTask(source, feed, time.time_ns, observer.feed_heard)
+        task = FeedTask(source, feed, time.time_ns, observer.feed_fixes)
         if recorded:
             await task.run()
             return feed
@@ -232,7 +230,7 @@ class Vehicle:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _follow_tiles(self, controller: HandoverController, number: int) -> None:
-        """Tell the controller what a server publishes, and again whenever that changes."""
+        """Pass what a server publishes to the controller, and again whenever that changes."""
         server = self._servers[number]
         is_known = False
         backoff = Backoff(FIRST_RETRY_S, LONGEST_RETRY_S)
@@ -243,7 +241,7 @@ class Vehicle:
             except RfedgeError as error:
                 if len(self._servers) == 1 and not is_known and not _may_pass(error, self._config):
                     raise
-                controller.retrying(RetryReason.TILES)
+                self._metrics.retries.labels(RetryReason.TILES).inc()
                 log.warning("tiles not listed", server=str(server.address), problem=str(error))
                 await asyncio.sleep(backoff.next_s())
                 continue
@@ -262,29 +260,33 @@ class Vehicle:
 
 
 class StreamFactory:
-    """Makes the clients of new streams, whose frames are encoded one at a time on ``encoder``,
-    and whose poses are searched on ``searcher``."""
+    """Makes the clients of new streams.
+
+    Frames are encoded one at a time on ``encoder``, poses are searched on ``searcher``.
+    """
 
     def __init__(
         self,
         config: AgentConfig,
         servers: Sequence[ServerConnection],
         fields: FieldCache,
+        observer: DriveObserver,
         encoder: Executor,
         searcher: Executor,
         feed: PoseFeed | None = None,
-        live: LiveCamera | LiveRig | None = None,
+        live: LiveCameras | None = None,
         *,
         take_notices: bool = False,
     ) -> None:
-        self._take_notices = take_notices
         self._config = config
         self._servers = tuple(servers)
         self._fields = fields
+        self._observer = observer
         self._encoder = encoder
         self._searcher = searcher
         self._feed = feed
         self._live = live
+        self._take_notices = take_notices
         self._sessions: deque[AgentSession] = deque(maxlen=4)
 
     async def prepare(self, served: ServedTile) -> OpenStream:
@@ -293,12 +295,11 @@ class StreamFactory:
         return partial(self._client, served, prepared)
 
     def _client(
-        self, served: ServedTile, prepared: PreparedField, observer: StreamObserver
+        self, served: ServedTile, prepared: PreparedField, owner: StreamOwner
     ) -> StreamClient:
-        places = self._places_on_rig(prepared)
         pipelines = {
-            camera.camera.camera_id: self._pipeline(prepared, camera, on_rig)
-            for camera, on_rig in zip(prepared.cameras, places, strict=True)
+            camera.camera.camera_id: self._pipeline(prepared, camera, poses)
+            for camera, poses in zip(prepared.cameras, self._camera_poses(prepared), strict=True)
         }
 
         def encode(job: EncodeJob) -> EncodedFrame:
@@ -307,13 +308,14 @@ class StreamFactory:
         session = self._session(self._hello(prepared, pipelines), prepared)
         source = CameraSource(prepared.pictures.take, encode, self._encoder)
         server, limits = self._servers[served.server], self._config.limits
-        return StreamClient(server, session, source, observer, limits, tile=served.tile.name)
+        return StreamClient(
+            server, session, source, owner, self._observer, limits, tile=served.tile.name
+        )
 
     def _pipeline(
-        self, prepared: PreparedField, camera: PreparedCamera, on_rig: OnRig | None
+        self, prepared: PreparedField, camera: PreparedCamera, poses: CameraPoses
     ) -> Pipeline:
-        config, field = self._config, prepared.field
-        is_alone = on_rig is None
+        config = self._config
         options = PipelineOptions(
             check_decode=config.coding.check_decode,
             light=config.coding.light,
@@ -321,61 +323,57 @@ class StreamFactory:
             qp_map=camera.qp_map,
             threads=config.render.threads,
             lights=prepared.lights,
-            feed=self._poses(field) if is_alone and not config.localise else None,
-            tracking=self._tracking(prepared) if is_alone and config.localise else None,
-            on_rig=on_rig,
+            poses=poses,
         )
-        return Pipeline(field, camera.codec, time.perf_counter_ns, options)
+        return Pipeline(prepared.field, camera.codec, time.perf_counter_ns, options)
 
-    def _places_on_rig(self, prepared: PreparedField) -> list[OnRig | None]:
-        """Return what says where each camera is, from the first, the rig's reference camera."""
+    def _camera_poses(self, prepared: PreparedField) -> list[CameraPoses]:
+        """Return what says where each camera is, the rig's reference camera first."""
+        source = self._pose_source(prepared.field)
+        tracking = self._tracking(prepared, source) if self._config.localise else None
         extrinsics = [camera.camera.camera_from_rig for camera in prepared.cameras]
         reference = extrinsics[0]
         if reference is None:
-            return [None]
-        measured = self._poses(prepared.field)
-        poses: RigPoses = DrivenRig() if measured is None else MeasuredRig(measured, reference)
+            return [tracking or KnownPoses(source)]
+        rig: RigPoses = RecordedRigPoses()
+        if not isinstance(source, DatasetPoses):
+            rig = MeasuredRigPoses(source, reference)
         tracked = None
-        if self._config.localise:
-            poses = tracked = TrackedRig(self._tracking(prepared), reference, poses)
+        if tracking is not None:
+            rig = tracked = TrackedRigPoses(tracking, reference, rig)
         return [
-            OnRig(camera_from_rig, poses, None if i else tracked)
+            RigCameraPoses(camera_from_rig, rig, None if i else tracked)
             for i, camera_from_rig in enumerate(extrinsics)
             if camera_from_rig is not None
         ]
 
-    def _tracking(self, prepared: PreparedField) -> Tracking:
+    def _tracking(self, prepared: PreparedField, source: PoseSource) -> CameraPoses:
         """Return what finds the camera in a field; imports OpenCV, which nothing else here needs.
 
         Raises ``RfedgeError`` where the extra is not installed.
         """
-        from cav_agent.tracking import CameraTracking, DatasetPoses
+        from cav_agent.tracking import CameraTracking
 
-        field, config = prepared.field, self._config
-        poses = self._poses(field)
         return CameraTracking(
-            prepared.lights or field,
+            prepared.lights,
             prepared.cameras[0].camera.intrinsics,
-            poses or DatasetPoses(),
+            source,
             self._searcher,
-            bounds=field.bounds,
-            patient=config.pace is PaceKind.LOCKSTEP,
+            bounds=prepared.field.bounds,
+            patient=self._config.pace is PaceKind.LOCKSTEP,
         )
 
-    def _poses(self, field: RadianceField) -> FollowedFeed | TrajectoryPoses | None:
-        """Return what says where the camera is in a field's axes, if not the pictures do."""
-        trajectory = self._live and self._live.poses(field.metadata.tile_origin)
-        return trajectory or self._followed(field)
-
-    def _followed(self, field: RadianceField) -> FollowedFeed | None:
-        """Return the feed's poses in a field's axes."""
-        feed, config = self._feed, self._config
-        if feed is None:
-            return None
+    def _pose_source(self, field: RadianceField) -> PoseSource:
+        """Return what measures the camera's poses, in a field's axes."""
         metadata = field.metadata
-        place = Place(metadata.anchor, metadata.tile_origin, config.feed.mount)
-        in_field = FieldFeed(feed, place, field.bounds)
-        return FollowedFeed(in_field, recorded=feed.recorded, rate_hz=config.rate)
+        trajectory = None if self._live is None else self._live.poses(metadata.tile_origin)
+        if trajectory is not None:
+            return trajectory
+        if self._feed is None:
+            return DatasetPoses()
+        mount = self._config.feed.mount
+        placement = FieldPlacement(metadata.anchor, metadata.tile_origin, mount)
+        return FeedPoses(self._feed, placement, field.bounds, rate_hz=self._config.rate)
 
     def _hello(self, prepared: PreparedField, pipelines: Mapping[str, Pipeline]) -> Hello:
         config = self._config
@@ -416,42 +414,19 @@ class StreamFactory:
         return session
 
 
-@dataclass(frozen=True)
-class Way:
-    """Where a recorded drive goes, (east, north) in metres, and when its pictures are captured if
-    not as ``HandoverController`` decides."""
-
-    positions: Sequence[tuple[float, float]] = ()
-    schedule: CaptureSchedule | None = None
-
-
-def _way(config: AgentConfig) -> Way:
-    """Read the drive that ``config`` names; empty for cameras that send now."""
-    if config.rig is not None:
-        return _way_of_rig(config, config.rig)
-    if config.drive is None:
-        return Way()
-    pictures = read_drive(config, TileOrigin())
-    return Way([picture.camera.world_from_cam.translation_m[:2] for picture in pictures])
-
-
-def _way_of_rig(config: AgentConfig, file: Path) -> Way:
-    rig = read_rig(file)
+def _read_rig(config: AgentConfig) -> Rig:
+    """Read the rig file, and check what only an agent wants of it."""
+    assert config.rig is not None
+    rig = read_rig(config.rig)
     for camera in rig.cameras:
         check_name("rig.camera.name", camera.name)
-    if rig.is_live:
-        if config.pace is not PaceKind.REALTIME:
-            raise InvalidInput("pace", f"{config.pace}: a live camera does not wait, use realtime")
-        return Way()
-    instants = read_rig_drive(rig)
-    schedule = None
-    if config.pace is PaceKind.LOCKSTEP:
-        schedule = Lockstep(len(instants), cameras=len(rig.cameras), loop=config.loop)
-    return Way([instant.world_from_rig.translation_m[:2] for instant in instants], schedule)
+    if rig.is_live and config.pace is not PaceKind.REALTIME:
+        raise InvalidInput("pace", f"{config.pace}: a live camera does not wait, use realtime")
+    return rig
 
 
 def yield_to_frames() -> None:
-    """Let every other thread go before the calling one; Linux alone has a niceness of threads."""
+    """Give every other thread priority over the calling one; only Linux has niceness of threads."""
     if sys.platform == "linux":
         thread = threading.get_native_id()
         niceness = os.getpriority(os.PRIO_PROCESS, thread) + SEARCH_NICENESS
@@ -459,7 +434,7 @@ def yield_to_frames() -> None:
 
 
 def _may_pass(error: RfedgeError, config: AgentConfig) -> bool:
-    """Whether a server that did not list its tiles at the start may do so later, and is waited for.
+    """Return whether to wait for a server that did not list its tiles at the start.
 
     A refused certificate, or a choice of field that is missing, is the vehicle's own mistake.
     """

@@ -194,7 +194,6 @@ def families() -> Mapping[str, Sequence[Family]]:
     """Return the metrics that each program declares, with those that a flag can add."""
     agent = AgentMetrics(CollectorRegistry())
     agent.identify("cav-1", "front")
-    agent.field_ready("0" * 16, "splats")
     server = ServerMetrics(CollectorRegistry(), per_vehicle=True)
     TwinMetrics(server.instruments, dict, int, per_vehicle=True)
     return {

@@ -33,7 +33,7 @@ from threading import Event, Lock, Thread
 from typing import Protocol
 
 from cav_agent.backoff import Backoff
-from cav_agent.live.record import HEADER_BYTES, EndRecord, FrameRecord, Header, Record, record_of
+from cav_agent.live.reader import HEADER_BYTES, EndRecord, FrameRecord, Header, Record, record_of
 from cav_agent.live.settings import ReaderSettings
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import Rgb
@@ -215,16 +215,16 @@ class Reader(Protocol):
 
 
 class SourceObserver(Protocol):
-    """Hears what happens to a source, on the source's thread."""
+    """Hears what happens to the sources of cameras, on the sources' threads."""
 
-    def source_open(self, clock: ClockKind) -> None:
+    def source_open(self, camera_id: str, clock: ClockKind) -> None:
         """Frames come, and their times rest on ``clock``; called again when that changes."""
 
-    def source_lost(self, problem: SourceProblem, text: str, begins: bool) -> None:
-        """It was lost, or could not be opened; ``begins``: it was not lost before."""
+    def source_lost(self, camera_id: str, problem: SourceProblem, text: str, begins: bool) -> None:
+        """The source was lost, or could not be opened; ``begins``: it was not lost before."""
 
     def source_frames(self, taken: int, dropped: int) -> None:
-        """So many more frames were taken over, or dropped before anybody coded them."""
+        """So many more frames were taken over, or dropped before they were coded."""
 
 
 @dataclass(frozen=True)
@@ -245,6 +245,7 @@ class LiveSource:
     def __init__(
         self,
         open_reader: Callable[[], Reader],
+        camera_id: str,
         size_px: tuple[int, int],
         observer: SourceObserver,
         *,
@@ -254,6 +255,7 @@ class LiveSource:
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
         self._open_reader, self._size_px = open_reader, size_px
+        self._camera_id = camera_id
         self._observer, self._arrived = observer, arrived
         self._timeout_s, self._repeats = timeout_s, repeats
         self._clocks = clocks or Clocks()
@@ -352,7 +354,7 @@ class LiveSource:
             self._newest = frame
         if stamp.clock is not self._kind or self._is_lost:
             self._kind, self._is_lost = stamp.clock, False
-            self._observer.source_open(stamp.clock)
+            self._observer.source_open(self._camera_id, stamp.clock)
         self._backoff.reset()
         self._observer.source_frames(1, dropped + superseded)
         self._arrived()
@@ -361,7 +363,7 @@ class LiveSource:
         self.close()
         begins, self._is_lost = not self._is_lost, True
         self._retry_at_s = self._clocks.monotonic_s() + self._backoff.next_s()
-        self._observer.source_lost(problem, text, begins)
+        self._observer.source_lost(self._camera_id, problem, text, begins)
 
 
 class SourceThread:

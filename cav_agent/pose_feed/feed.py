@@ -1,111 +1,46 @@
-"""A feed as the agent holds it: bytes go in on the event loop, measured poses come out per field.
+"""A pose feed as the agent holds it: bytes go in on the event loop, checked fixes come out.
 
-``PoseFeed`` is one for the vehicle; its fixes are on the Earth or in the drives' global frame.
-``FieldFeed`` reads them for one field: placed by its anchor, inside its bounds, each once. The two
-may be used by different threads. ``FeedReader`` makes fixes of bytes: of lines, whose format shows
-in how they begin.
-
-``TimeOffset`` tells how late a feed's times are against the camera's, from the poses the field
-gave. A fix stamped t that was the vehicle's position at t + tau lies off the true path by about
-velocity * tau; a bias adds the same everywhere. Over fixes with errors e and velocities v,
-
-    e = bias + v tau + noise,
-
-the least-squares tau is sum (v - mean v)(e - mean e) / sum |v - mean v|^2: it is known as far as
-the velocity has changed, in size or direction. A machine; old fixes are forgotten.
+``FeedReader`` makes fixes of lines, whose format shows in how they begin. ``FeedChecks`` decides
+which fixes are used and at what time of the agent's clock: it looks at their order, the feed's
+clock, jumps and silence. ``PoseFeed`` joins them and keeps the fixes of a vehicle. All are state
+machines: ``now_ns`` is an argument.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from threading import Lock
 
-import numpy as np
-
-from cav_agent.pose_feed.checks import NS, FeedChecks, ProblemLog
 from cav_agent.pose_feed.fix import BadReading, FeedProblem, Fix
 from cav_agent.pose_feed.json_lines import JsonParser
 from cav_agent.pose_feed.nmea import NmeaParser
-from cav_agent.pose_feed.placing import Place
-from rfcore.camera import Vec3
-from rfcore.errors import InvalidInput
-from rfcore.field import Bounds
-from rfcore.localise.prior import PoseMeasurement
 
-__all__ = ["FeedReader", "FieldFeed", "PoseFeed", "TimeOffset", "TimeOffsetEstimator"]
+__all__ = ["FeedChecks", "FeedReader", "PoseFeed", "ProblemLog", "distance_m"]
 
-KEPT = 300
-FEWEST = 8
-DETERMINED_S = 0.1
-"""A larger standard deviation says nothing."""
-LONGEST_GAP_S = 1.0
-"""Between poses of the field that a fix is compared with."""
-
-
-@dataclass(frozen=True)
-class TimeOffset:
-    """Add ``seconds`` to a feed's times to get the camera's; one sigma ``std_s``."""
-
-    seconds: float
-    std_s: float
-
-
-class TimeOffsetEstimator:
-    """Collects where the camera was and what the feed said of that."""
-
-    def __init__(self) -> None:
-        self._path: deque[tuple[float, Vec3]] = deque(maxlen=KEPT)
-        self._pairs: deque[tuple[Vec3, Vec3]] = deque(maxlen=KEPT)
-        self._waiting: deque[tuple[float, Vec3]] = deque(maxlen=KEPT)
-
-    def localised(self, time_s: float, position_m: Vec3) -> None:
-        """Take a position the field gave; raise ``InvalidInput`` for time that goes back."""
-        if self._path and time_s <= self._path[-1][0]:
-            raise InvalidInput("time_s", f"{time_s} is not after {self._path[-1][0]}")
-        self._path.append((time_s, position_m))
-        while self._waiting and self._waiting[0][0] <= time_s:
-            self._compare(*self._waiting.popleft())
-
-    def measured(self, time_s: float, position_m: Vec3) -> None:
-        """Take a position the feed gave, compared as soon as the path has come so far."""
-        self._waiting.append((time_s, position_m))
-
-    def offset(self) -> TimeOffset | None:
-        """Return the offset, None while the drive does not determine it to 0.1 s."""
-        if len(self._pairs) < FEWEST:
-            return None
-        pairs = np.array(self._pairs)
-        errors, velocities = pairs[:, 0], pairs[:, 1]
-        errors, velocities = errors - errors.mean(axis=0), velocities - velocities.mean(axis=0)
-        change = float((velocities**2).sum())
-        if change <= 0.0:
-            return None
-        seconds = float((velocities * errors).sum()) / change
-        noise = float(((errors - seconds * velocities) ** 2).sum())
-        std_s = math.sqrt(noise / (3 * len(pairs) - 4) / change)
-        return TimeOffset(seconds, std_s) if std_s <= DETERMINED_S else None
-
-    def _compare(self, time_s: float, position_m: Vec3) -> None:
-        times = [at_s for at_s, _ in self._path]
-        after = bisect_right(times, time_s)
-        after = after - 1 if after == len(times) and times[-1] == time_s else after
-        if not 0 < after < len(times) or times[after] - times[after - 1] > LONGEST_GAP_S:
-            return
-        (begin_s, a), (end_s, b) = self._path[after - 1], self._path[after]
-        share = (time_s - begin_s) / (end_s - begin_s)
-        velocity = [(q - p) / (end_s - begin_s) for p, q in zip(a, b, strict=True)]
-        error = [z - p - share * (q - p) for z, p, q in zip(position_m, a, b, strict=True)]
-        self._pairs.append(
-            ((error[0], error[1], error[2]), (velocity[0], velocity[1], velocity[2]))
-        )
-
-
+NS = 1_000_000_000
 MAX_LINE_BYTES = 4096
 """NMEA allows 82, gpsd's reports take up to 1.5 KB."""
+KEPT_FIXES = 2000
+"""Of a live feed: more than a minute at any rate of a receiver."""
+MOST_RECORDED = 2_000_000
+CLOCK_NS = 2 * NS
+"""A feed's clock further from ours than this is another clock: its times are shifted."""
+CLOCK_WINDOW = 20
+"""Fixes whose least delay is the difference of the clocks."""
+ZONE_NS = 15 * 60 * NS
+"""Zones of the Earth differ by multiples of a quarter of an hour."""
+FASTEST_MPS = 80.0
+"""Faster than any vehicle this is for: 288 km/h."""
+SIGMAS = 4.0
+RESTARTED_AFTER = 3
+"""So many fixes in order among themselves, but before the last used: the feed began again."""
+SILENT_PERIODS = 3.0
+LEAST_SILENT_NS = 2 * NS
+QUIET_S = 30.0
+EARTH_M = 6_371_000.0
 
 
 class FeedReader:
@@ -165,26 +100,134 @@ def _too_long() -> BadReading:
     return BadReading(FeedProblem.MALFORMED, f"a line of more than {MAX_LINE_BYTES} bytes")
 
 
-KEPT_FIXES = 2000
-"""Of a live feed: more than a minute at any rate of a receiver."""
-MOST_RECORDED = 2_000_000
-MARGIN_M = 50.0
-SIGMAS = 4.0
-"""A position is outside a field's bounds if it is that far beyond them."""
+class ProblemLog:
+    """Passes problems on to ``tell``, with whether each begins: it is new, or was away for long."""
+
+    def __init__(self, tell: Callable[[FeedProblem, str, bool], None]) -> None:
+        self._tell = tell
+        self._last_ns: dict[FeedProblem, int] = {}
+
+    def note(self, problem: FeedProblem, text: str, now_ns: int) -> None:
+        """Note a problem."""
+        last_ns = self._last_ns.get(problem)
+        self._last_ns[problem] = now_ns
+        begins = last_ns is None or now_ns - last_ns > QUIET_S * NS
+        self._tell(problem, text, begins)
+
+
+class FeedChecks:
+    """Decides about the fixes of one feed; ``recorded``: from a file, whose clock is its own."""
+
+    def __init__(self, problems: ProblemLog, *, recorded: bool = False) -> None:
+        self._problems = problems
+        self._recorded = recorded
+        self._last: Fix | None = None
+        self._refused: list[Fix] = []
+        self._delays_ns: deque[int] = deque(maxlen=CLOCK_WINDOW)
+        self._used_at_ns: int | None = None
+        self._period_ns = float(NS)
+        self._is_silent = False
+        self.shift_ns = 0
+        """To add to the feed's times to get the agent's."""
+
+    def receive(self, fix: Fix, now_ns: int) -> bool:
+        """Return whether a fix is to be used."""
+        if not self._is_newer(fix, now_ns):
+            return False
+        self._check_jump(fix, now_ns)
+        if self._last is not None:
+            step_ns = fix.time_ns - self._last.time_ns
+            self._period_ns += 0.2 * (min(step_ns, 10 * NS) - self._period_ns)
+        self._last, self._used_at_ns, self._is_silent = fix, now_ns, False
+        if not self._recorded:
+            self._compare_clocks(fix, now_ns)
+        return True
+
+    def idle(self, now_ns: int) -> None:
+        """Notice silence; to be called now and then, at least once a second."""
+        if self._used_at_ns is None:
+            self._used_at_ns = now_ns
+        silent_ns = now_ns - self._used_at_ns
+        limit_ns = max(SILENT_PERIODS * self._period_ns, LEAST_SILENT_NS)
+        if not self._is_silent and silent_ns > limit_ns:
+            self._is_silent = True
+            self._problems.note(FeedProblem.SILENT, f"no fix for {silent_ns / NS:.1f} s", now_ns)
+
+    def _is_newer(self, fix: Fix, now_ns: int) -> bool:
+        if self._last is None or fix.time_ns > self._last.time_ns:
+            self._refused.clear()
+            return True
+        if fix.time_ns == self._last.time_ns:
+            return False
+        back_s = (self._last.time_ns - fix.time_ns) / NS
+        text = f"a fix is {back_s:.3f} s older than the one before"
+        self._problems.note(FeedProblem.BACKWARDS, text, now_ns)
+        in_order = not self._refused or fix.time_ns > self._refused[-1].time_ns
+        self._refused = [*self._refused, fix] if in_order else [fix]
+        if len(self._refused) < RESTARTED_AFTER:
+            return False
+        self._refused.clear()
+        self._delays_ns.clear()
+        self._last = None
+        return True
+
+    def _check_jump(self, fix: Fix, now_ns: int) -> None:
+        last = self._last
+        if last is None or (fix.xyz_m is None) != (last.xyz_m is None):
+            return
+        seconds = (fix.time_ns - last.time_ns) / NS
+        far_m = distance_m(last, fix)
+        spread_m = math.hypot(*fix.position_std_m[:2], *last.position_std_m[:2])
+        if far_m > FASTEST_MPS * seconds + SIGMAS * spread_m:
+            text = f"{far_m:.1f} m in {seconds:.2f} s; the field will tell whether it is so"
+            self._problems.note(FeedProblem.JUMP, text, now_ns)
+
+    def _compare_clocks(self, fix: Fix, now_ns: int) -> None:
+        """Shift the feed's times by the least delay seen, where the clocks differ."""
+        self._delays_ns.append(now_ns - fix.time_ns)
+        least_ns = min(self._delays_ns)
+        if abs(least_ns) <= CLOCK_NS:
+            self.shift_ns = 0
+            return
+        if abs(least_ns - self.shift_ns) > CLOCK_NS:
+            self._problems.note(FeedProblem.CLOCK, _difference_text(least_ns), now_ns)
+        self.shift_ns = least_ns
+
+
+def _difference_text(delay_ns: int) -> str:
+    zones = round(delay_ns / ZONE_NS)
+    side = "behind" if delay_ns > 0 else "ahead of"
+    text = f"the feed's clock is {abs(delay_ns) / NS:.1f} s {side} ours"
+    if zones and abs(delay_ns - zones * ZONE_NS) <= CLOCK_NS:
+        text += f", the time zone of UTC{-zones * 0.25:+g} h: set it to UTC"
+    return f"{text}; its times are shifted by that"
+
+
+def distance_m(a: Fix, b: Fix) -> float:
+    """Return how far apart two fixes are on the ground, to a hundredth: a sphere's arcs."""
+    if a.xyz_m is not None and b.xyz_m is not None:
+        return math.dist(a.xyz_m, b.xyz_m)
+    assert a.geodetic is not None
+    assert b.geodetic is not None
+    (lat_a, lon_a, _), (lat_b, lon_b, _) = a.geodetic, b.geodetic
+    turn_deg = (lon_b - lon_a + 180.0) % 360.0 - 180.0
+    east = math.radians(turn_deg) * math.cos(math.radians(0.5 * (lat_a + lat_b)))
+    return EARTH_M * math.hypot(east, math.radians(lat_b - lat_a))
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """A fix that is used, at its time of the agent's clock."""
+class KeptFix:
+    """A fix that is used, with its time on the agent's clock."""
 
     fix: Fix
     time_ns: int
 
 
 class PoseFeed:
-    """The fixes of one source. ``tell`` hears of problems: which, in words, and if it begins.
+    """The fixes of one source; written by one thread, read by others.
 
-    ``recorded``: the whole feed lies in a file, and its clock is that of the drive.
+    ``tell`` is called with each problem, its text, and whether it begins. ``recorded``: the whole
+    feed lies in a file, and its clock is that of the drive.
     """
 
     def __init__(
@@ -200,7 +243,7 @@ class PoseFeed:
         self._checks = FeedChecks(self.problems, recorded=recorded)
         self._reader = FeedReader(self._refused)
         self._lock = Lock()
-        self._kept: deque[_Kept] = deque(maxlen=MOST_RECORDED if recorded else KEPT_FIXES)
+        self._kept: deque[KeptFix] = deque(maxlen=MOST_RECORDED if recorded else KEPT_FIXES)
         self._now_ns = 0
         self.count = 0
         """Fixes used so far."""
@@ -235,76 +278,10 @@ class PoseFeed:
             if self._checks.receive(fix, now_ns):
                 time_ns = fix.time_ns + self._checks.shift_ns + self._offset_ns
                 with self._lock:
-                    self._kept.append(_Kept(fix, max(time_ns, 0)))
+                    self._kept.append(KeptFix(fix, max(time_ns, 0)))
                     self.count += 1
                 used += 1
         return used
 
     def _refused(self, error: BadReading) -> None:
         self.problems.note(error.problem, str(error), self._now_ns)
-
-
-class FieldFeed:
-    """What a feed says of the camera in one field; ``bounds`` None: anywhere."""
-
-    def __init__(self, feed: PoseFeed, place: Place, bounds: Bounds | None = None) -> None:
-        self._feed, self._place, self._bounds = feed, place, bounds
-        self._number = 0
-        self._waiting: deque[tuple[Fix, int]] = deque()
-        self._estimator = TimeOffsetEstimator()
-
-    def measurements(self, until_ns: int) -> list[PoseMeasurement]:
-        """Return the poses measured up to a time of the camera's clock, each once, in order.
-
-        None of them: the feed has said nothing new.
-        """
-        new, self._number = self._feed.since(self._number)
-        self._waiting.extend(new)
-        found = []
-        while self._waiting and self._waiting[0][1] <= until_ns:
-            measurement = self._measurement(*self._waiting.popleft())
-            if measurement is not None:
-                found.append(measurement)
-        return found
-
-    def restart(self) -> None:
-        """Begin again with the first fix that is kept: of a recorded feed, with the drive."""
-        self._number = 0
-        self._waiting.clear()
-
-    def localised(self, time_ns: int, position_m: Vec3) -> None:
-        """Take where the field says that the camera was: it tells how late the feed is."""
-        try:
-            self._estimator.localised(time_ns / NS, position_m)
-        except InvalidInput:
-            self._estimator = TimeOffsetEstimator()  # a drive begins again
-
-    def time_offset(self) -> TimeOffset | None:
-        """Return what to add to the feed's times, None where the drive does not tell."""
-        return self._estimator.offset()
-
-    def _measurement(self, fix: Fix, time_ns: int) -> PoseMeasurement | None:
-        try:
-            measurement = self._place.measurement(fix, time_ns)
-        except InvalidInput as error:
-            no_anchor = fix.geodetic is not None and self._place.anchor is None
-            problem = FeedProblem.NO_ANCHOR if no_anchor else FeedProblem.NOT_FINITE
-            self._feed.problems.note(problem, str(error), time_ns)
-            return None
-        if not self._is_inside(measurement):
-            where = ", ".join(f"{value:.0f}" for value in measurement.position_m)
-            text = f"({where}) m is beyond the field's bounds"
-            self._feed.problems.note(FeedProblem.OUTSIDE, text, time_ns)
-            return None
-        self._estimator.measured(time_ns / NS, measurement.position_m)
-        return measurement
-
-    def _is_inside(self, measurement: PoseMeasurement) -> bool:
-        if self._bounds is None:
-            return True
-        corners = zip(self._bounds.low_m, self._bounds.high_m, strict=True)
-        axes = zip(measurement.position_m, measurement.position_std_m, corners, strict=True)
-        return all(
-            low - MARGIN_M - SIGMAS * std <= at <= high + MARGIN_M + SIGMAS * std
-            for at, std, (low, high) in axes
-        )

@@ -205,9 +205,7 @@ class VirtualVehicle:
         now = self._events.now
         posed = PosedPicture("", Camera(camera.intrinsics, Pose.identity()), _no_picture)
         time_ns = round(1e9 * now)
-        return Capture(
-            self._instant, posed, now, time_ns, camera_id=camera.camera_id, instant=self._instant
-        )
+        return Capture(camera.camera_id, self._instant, posed, now, time_ns, instant=self._instant)
 
     def _pump(self) -> None:
         job = self._agent.job_to_start(self._events.now)
@@ -236,7 +234,7 @@ class VirtualVehicle:
         self._sequence[camera_id] = job.epoch, sequence
         payload = bytes(self._payload_bytes(job))
         packet = DeltaPacket(job.epoch, sequence, DIGEST, b"", DIGEST, payload, 0).sealed()
-        coded = EncodedFrame(packet, {"encode": self._costs.sender_s})
+        coded = EncodedFrame(packet, {"encode": self._costs.sender_s}, Pose.identity())
         self._agent.encoded(coded, self._events.now)
         self._pump()
 

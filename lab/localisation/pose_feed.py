@@ -22,8 +22,7 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from cav_agent.pose_feed.placing import CameraMount
-from cav_agent.pose_feed.settings import parse_source
+from cav_agent.pose_feed import CameraMount, parse_source
 from lab.localisation.pose_errors import PoseErrorModel, observed, parse_error_model
 from rfcore.camera import Pose, TileOrigin
 from rfcore.dataset import read_dataset

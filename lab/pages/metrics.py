@@ -36,7 +36,6 @@ def families() -> Mapping[str, Sequence[Family]]:
     """Return what each command declares, with everything that a flag can add."""
     agent = AgentMetrics(CollectorRegistry())
     agent.identify("cav-1", "front")
-    agent.field_ready("0" * 16, "splats")
     server = ServerMetrics(CollectorRegistry(), per_vehicle=True)
     TwinMetrics(server.instruments, Twin(), per_vehicle=True)
     return {

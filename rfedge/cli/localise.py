@@ -121,13 +121,13 @@ class Localise:
         console: Console,
     ) -> list[PosePrior | None]:
         """Return what the feed knows of each picture's pose; say what is wrong with the feed."""
-        from cav_agent.pose_feed.placing import CameraMount, Place
+        from cav_agent.pose_feed import CameraMount, FieldPlacement
         from rfcore.errors import InvalidInput
 
-        place = Place(
+        placement = FieldPlacement(
             field.metadata.anchor, field.metadata.tile_origin, CameraMount(self.camera_at)
         )
-        priors = feed.priors(pictures, place, field.bounds, self.rate)
+        priors = feed.priors(pictures, placement, field.bounds, self.rate)
         for problem, times in feed.problems.items():
             console.print(f"{self.pose_feed}: {problem}, {times} times", highlight=False)
         if not any(priors):

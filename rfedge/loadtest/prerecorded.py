@@ -22,7 +22,6 @@ from enum import StrEnum
 from pathlib import Path
 from random import Random
 
-from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig
@@ -286,21 +285,17 @@ def _coded(
     intrinsics = pictures[0].camera.intrinsics
     config = CodecConfig(intrinsics.width_px, intrinsics.height_px, effort, crf)
     pipeline = Pipeline(field, config, time.perf_counter_ns)
-    captures = [_capture(index, picture) for index, picture in enumerate(pictures)]
-    chain = [_frame(pipeline, capture, 0, capture.index - 1) for capture in captures]
-    alone = [_frame(pipeline, capture, capture.index + 1) for capture in captures]
+    rounded = [replace(picture, camera=picture.camera.rounded()) for picture in pictures]
+    chain = [_frame(pipeline, picture, 0, index - 1) for index, picture in enumerate(rounded)]
+    alone = [_frame(pipeline, picture, index + 1) for index, picture in enumerate(rounded)]
     camera = CameraDescription(CAMERA, intrinsics, pipeline.header)
     return PrerecordedDrive(_hello(camera, field.field_id), tuple(chain), tuple(alone))
 
 
-def _capture(index: int, picture: PosedPicture) -> Capture:
-    return Capture(index, replace(picture, camera=picture.camera.rounded()), 0.0, 0)
-
-
-def _frame(pipeline: Pipeline, capture: Capture, epoch: int, after: int = -1) -> Frame:
+def _frame(pipeline: Pipeline, picture: PosedPicture, epoch: int, after: int = -1) -> Frame:
     base = FrameAddress(CAMERA, epoch, after) if after >= 0 else None
-    packet = pipeline.encode(EncodeJob(capture, epoch, 1, base)).packet
-    return Frame(CAMERA, 0, capture.picture.camera.world_from_cam, b"", packet)
+    packet = pipeline.encode_picture(picture, epoch, base)
+    return Frame(CAMERA, 0, picture.camera.world_from_cam, b"", packet)
 
 
 def payload_drive(field_id: str, size_bytes: int) -> PrerecordedDrive:

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from cav_agent.frames import Capture
-from cav_agent.pose_feed.feed import FieldFeed, PoseFeed
-from cav_agent.pose_feed.fix import FeedProblem
-from cav_agent.pose_feed.following import FollowedFeed
-from cav_agent.pose_feed.placing import Place
+from cav_agent.pose_feed import (
+    FeedPoses,
+    FeedProblem,
+    FieldPlacement,
+    PoseFeed,
+    recorded_time_ns,
+)
 from rfcore.errors import InvalidData, RfedgeError
 from rfcore.field import Bounds
 from rfcore.localise.localiser import Localised
@@ -31,8 +33,8 @@ class RecordedFeed:
 
     def __init__(self, offset_s: float) -> None:
         self.problems: Counter[FeedProblem] = Counter()
-        self._in_field: FieldFeed
-        self._followed: FollowedFeed
+        self._poses: FeedPoses
+        self._times_ns: list[int]
         self._feed = PoseFeed(self._told, offset_s=offset_s, recorded=True)
 
     @staticmethod
@@ -52,15 +54,21 @@ class RecordedFeed:
         return self._feed.count
 
     def priors(
-        self, pictures: Sequence[PosedPicture], place: Place, bounds: Bounds, rate_hz: float
+        self,
+        pictures: Sequence[PosedPicture],
+        placement: FieldPlacement,
+        bounds: Bounds,
+        rate_hz: float,
     ) -> list[PosePrior | None]:
         """Return what is known of each picture's pose when it is taken, None before the feed."""
-        self._in_field = FieldFeed(self._feed, place, bounds)
-        followed = self._followed = FollowedFeed(self._in_field, recorded=True, rate_hz=rate_hz)
+        poses = self._poses = FeedPoses(self._feed, placement, bounds, rate_hz=rate_hz)
+        self._times_ns = [
+            recorded_time_ns(picture, index, rate_hz) for index, picture in enumerate(pictures)
+        ]
         found: list[PosePrior | None] = []
-        for index, picture in enumerate(pictures):
+        for time_ns in self._times_ns:
             try:
-                found.append(followed.prior(Capture(index, picture, 0.0, 0)))
+                found.append(poses.prior(time_ns))
             except RfedgeError:
                 found.append(None)
         return found
@@ -68,12 +76,11 @@ class RecordedFeed:
     def time_offset(self, pictures: Sequence[PosedPicture], done: Sequence[SearchOutcome]) -> str:
         """Return in words how late the feed is, by the poses that were found; after ``priors``."""
         found = {id(one.picture): one.answer for one in done}
-        for index, picture in enumerate(pictures):
+        for picture, time_ns in zip(pictures, self._times_ns, strict=True):
             answer = found.get(id(picture))
             if isinstance(answer, Localised):
-                time_ns = self._followed.time_ns(Capture(index, picture, 0.0, 0))
-                self._in_field.localised(time_ns, answer.world_from_cam.translation_m)
-        offset = self._in_field.time_offset()
+                self._poses.localised(time_ns, answer.world_from_cam.translation_m)
+        offset = self._poses.time_offset()
         if offset is None:
             return "time offset not determined: too few fixes, or no change of velocity"
         return f"add {offset.seconds:.3f} s to its times (one sigma {offset.std_s:.3f} s)"

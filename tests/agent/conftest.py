@@ -34,7 +34,7 @@ def make_capture() -> Callable[..., Capture]:
             Camera(INTRINSICS, Pose.identity()),
             lambda: np.zeros((16, 32, 3), np.uint8),
         )
-        return Capture(index, picture, captured_s, 1_000 + index)
+        return Capture("front", index, picture, captured_s, 1_000 + index)
 
     return make
 
@@ -58,7 +58,7 @@ def encode() -> Callable[[EncodeJob], EncodedFrame]:
             zlib.crc32(payload),
         )
         state["sequence"] += 1
-        return EncodedFrame(packet, {"render": 0.01, "encode": 0.02})
+        return EncodedFrame(packet, {"render": 0.01, "encode": 0.02}, Pose.identity())
 
     return run
 

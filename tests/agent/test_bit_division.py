@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cav_agent.bit_division import LEAST_SHARE, BitDivision
+from cav_agent.rate_control import LEAST_CAMERA_SHARE, BitDivision
 from rfcore.errors import InvalidInput
 
 NAMES = [f"cam{i}" for i in range(18)]
@@ -26,7 +26,7 @@ def test_shares_sum_to_the_budget_and_none_starves(
     shares = division.divide(total, names)
     assert set(shares) == set(names)
     assert sum(shares.values()) == pytest.approx(total, rel=1e-9)
-    assert min(shares.values()) >= LEAST_SHARE * total / len(names) * (1 - 1e-9)
+    assert min(shares.values()) >= LEAST_CAMERA_SHARE * total / len(names) * (1 - 1e-9)
 
 
 @given(codings, st.floats(1.0, 1e9))
@@ -61,7 +61,9 @@ def test_bytes_at_another_crf_are_compared_at_one() -> None:
 
 def test_priority_weighs() -> None:
     shares = BitDivision({"front": 3.0}).divide(1000.0, ["front", "rear"])
-    assert shares["front"] == pytest.approx(1000 * (LEAST_SHARE / 2 + (1 - LEAST_SHARE) * 0.75))
+    assert shares["front"] == pytest.approx(
+        1000 * (LEAST_CAMERA_SHARE / 2 + (1 - LEAST_CAMERA_SHARE) * 0.75)
+    )
 
 
 @pytest.mark.parametrize("priority", [0.0, -1.0, float("nan"), float("inf")])

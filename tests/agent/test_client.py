@@ -13,7 +13,6 @@ from structlog.testing import capture_logs
 
 from cav_agent.client import CameraSource, CameraTaken, FieldNotServed, StreamClient
 from cav_agent.config import AgentLimits
-from cav_agent.drive_pictures import OneCamera, RecordedPictures
 from cav_agent.frames import (
     Capture,
     EncodedFrame,
@@ -25,7 +24,6 @@ from cav_agent.frames import (
 )
 from cav_agent.rate_control import RateControl
 from cav_agent.session import AgentSession
-from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.errors import CodecError, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.conventions import TILE, VEHICLE
 from rfcore.wire.convert import client_message_from_bytes
@@ -131,7 +129,7 @@ class MemoryServer:
 
 @dataclass
 class Heard:
-    """An observer that keeps what it was told; ``client`` finishes after so many results."""
+    """The owner and observer of a client; keeps what it was told."""
 
     results: list[FrameResult] = field(default_factory=list)
     connections: list[bool] = field(default_factory=list)
@@ -142,6 +140,9 @@ class Heard:
     def ended(self, result: FrameResult) -> None:
         self.results.append(result)
         self.on_result()
+
+    def welcomed(self) -> None:
+        assert self.connections[-1]
 
     def connected(self, is_connected: bool) -> None:
         self.connections.append(is_connected)
@@ -183,12 +184,11 @@ def open_client(
         take: Callable[[int], Sequence[Capture]] | None = None,
         rate_control: RateControl | None = None,
     ) -> StreamClient:
-        pictures = tuple(make_capture(index).picture for index in range(4))
         limits = limits or AgentLimits()
         session = AgentSession(hello, limits, rate_control)
-        drive = OneCamera("front", RecordedPictures(pictures), MaskSettings())
-        source = CameraSource(take or drive.take, coder, executor)
-        return StreamClient(server, session, source, heard, limits, tile="street")  # type: ignore[arg-type]
+        take = take or (lambda index: [make_capture(index, time.monotonic())])
+        source = CameraSource(take, coder, executor)
+        return StreamClient(server, session, source, heard, heard, limits, tile="street")  # type: ignore[arg-type]
 
     return make
 

@@ -1,6 +1,7 @@
 """What is recorded of a drive: a line per picture, log lines for what went wrong, and metrics."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from prometheus_client import CollectorRegistry
 from structlog.testing import capture_logs
 
 from cav_agent.deadline import DeadlineController, Step
-from cav_agent.frame_log import DriveObserver, FrameLog, log_line
+from cav_agent.frame_log import DriveObserver, log_line
 from cav_agent.frames import (
     Capture,
     EncodedFrame,
@@ -29,6 +30,7 @@ from rfcore.wire.address import Address
 from rfcore.wire.messages import StageTimes
 from rfcore.wire.tiles import Tile
 
+Value = Callable[..., float | None]
 ADDRESSES = (Address("127.0.0.1", 50051), Address("127.0.0.1", 50052))
 
 
@@ -38,8 +40,23 @@ def registry() -> CollectorRegistry:
 
 
 @pytest.fixture
-def observer(registry: CollectorRegistry) -> DriveObserver:
-    return DriveObserver(AgentMetrics(registry), ADDRESSES)
+def metrics(registry: CollectorRegistry) -> AgentMetrics:
+    return AgentMetrics(registry)
+
+
+@pytest.fixture
+def observer(metrics: AgentMetrics) -> DriveObserver:
+    return DriveObserver(metrics, ADDRESSES)
+
+
+@pytest.fixture
+def value(registry: CollectorRegistry) -> Value:
+    """Return a function that reads an agent's metric by the rest of its name and its labels."""
+
+    def read(name: str, **labels: str) -> float | None:
+        return registry.get_sample_value(f"rfedge_agent_{name}", labels)
+
+    return read
 
 
 @pytest.fixture
@@ -88,20 +105,29 @@ def test_what_a_dropped_picture_did_not_get_to_is_null(
     assert set(line) == set(log_line(acked)), "every line has every key"
     assert (line["result"], line["reason"]) == ("dropped", "superseded")
     assert line["stage_ms"] == {}
-    filled = {"name", "index", "capture_time_ns", "result", "reason", "problem", "stage_ms"}
+    filled = {
+        "name",
+        "index",
+        "camera",
+        "capture_time_ns",
+        "result",
+        "reason",
+        "problem",
+        "stage_ms",
+    }
     assert {key for key, value in line.items() if value is not None} == filled
 
 
 def test_the_file_is_whole_up_to_the_last_picture_that_ended(
-    tmp_path: Path, registry: CollectorRegistry, acked: FrameResult
+    tmp_path: Path, metrics: AgentMetrics, acked: FrameResult
 ) -> None:
-    frame_log = FrameLog(tmp_path / "frames.jsonl")
-    observer = DriveObserver(AgentMetrics(registry), ADDRESSES, frame_log)
-    for count in (1, 2, 3):
-        observer.ended(acked)
-        lines = (tmp_path / "frames.jsonl").read_text().splitlines()
-        assert [json.loads(line) for line in lines] == [log_line(acked)] * count
-    frame_log.close()
+    file = tmp_path / "frames.jsonl"
+    with file.open("w", buffering=1) as frame_log:
+        observer = DriveObserver(metrics, ADDRESSES, frame_log)
+        for count in (1, 2, 3):
+            observer.ended(acked)
+            lines = file.read_text().splitlines()
+            assert [json.loads(line) for line in lines] == [log_line(acked)] * count
 
 
 # --- log lines
@@ -130,18 +156,22 @@ def test_a_refused_frame_is_logged_with_what_names_it_at_both_ends(
 
 
 def test_a_picture_dropped_before_it_was_coded_is_counted_and_not_logged(
-    observer: DriveObserver, registry: CollectorRegistry, make_capture: Callable[..., Capture]
+    observer: DriveObserver, value: Value, make_capture: Callable[..., Capture]
 ) -> None:
     with capture_logs() as lines:
         observer.ended(FrameResult(make_capture(0), Outcome.DROPPED, EndReason.TOO_LATE))
     assert lines == []
-    labels = {"result": "dropped", "reason": "too_late"}
-    assert registry.get_sample_value("rfedge_agent_frames_total", labels) == 1
+    assert value("frames_total", result="dropped", reason="too_late") == 1
+    assert value("sent_bytes_total") == 0
 
 
 @pytest.mark.parametrize(("budget", "logged"), [(None, 1), (ByteBudget(500.0, 750), 0)])
 def test_a_slice_coded_again_is_logged_unless_rate_control_asked_for_it(
-    observer: DriveObserver, acked: FrameResult, budget: ByteBudget | None, logged: int
+    observer: DriveObserver,
+    value: Value,
+    acked: FrameResult,
+    budget: ByteBudget | None,
+    logged: int,
 ) -> None:
     assert acked.encoded is not None
     encoded = replace(acked.encoded, tries=3)
@@ -149,6 +179,7 @@ def test_a_slice_coded_again_is_logged_unless_rate_control_asked_for_it(
         observer.ended(replace(acked, encoded=encoded, budget=budget))
     events = [line["event"] for line in lines]
     assert events == ["slice above the limit coded again"] * logged
+    assert value("recoded_frames_total") == 1
 
 
 def test_a_fall_of_quality_and_its_rise_are_logged_with_what_the_path_carries(
@@ -165,7 +196,7 @@ def test_a_fall_of_quality_and_its_rise_are_logged_with_what_the_path_carries(
 
 
 def test_the_pose_feeds_time_offset_is_a_metric_and_logged_when_it_changed(
-    observer: DriveObserver, registry: CollectorRegistry, acked: FrameResult
+    observer: DriveObserver, value: Value, acked: FrameResult
 ) -> None:
     assert acked.encoded is not None
     with capture_logs() as lines:
@@ -174,28 +205,89 @@ def test_the_pose_feeds_time_offset_is_a_metric_and_logged_when_it_changed(
             observer.ended(replace(acked, encoded=replace(acked.encoded, fix=fix)))
     told = [line["seconds"] for line in lines if line["event"] == "pose feed's time offset"]
     assert told == [0.21, 0.4]
-    assert registry.get_sample_value("rfedge_agent_pose_feed_offset_seconds") == 0.4
+    assert value("pose_feed_offset_seconds") == 0.4
 
 
 def test_a_handover_is_counted_by_its_cause_and_names_server_and_tile(
-    observer: DriveObserver, registry: CollectorRegistry
+    observer: DriveObserver, value: Value
 ) -> None:
     with capture_logs() as lines:
         observer.handed_over(ServedTile(1, Tile("east", "ab" * 32)), HandoverCause.SERVER_LOST)
     (line,) = lines
     assert (line["server"], line["tile"]) == ("127.0.0.1:50052", "east")
-    labels = {"cause": "server_lost"}
-    assert registry.get_sample_value("rfedge_agent_handovers_total", labels) == 1
+    assert value("handovers_total", cause="server_lost") == 1
 
 
-def test_a_step_to_a_faster_rung_is_logged_with_both_rungs(observer: DriveObserver) -> None:
+def test_a_vehicle_under_a_deadline_shows_its_rung_its_steps_and_what_was_late(
+    observer: DriveObserver, value: Value
+) -> None:
     good = MeasuredRung(Rung(), 80.0, 30.0, 0.0)
     quick = MeasuredRung(Rung(references=0), 20.0, 12.0, 60.0)
     controller = DeadlineController((good, quick), 33.0)
+    controller.late = True
     with capture_logs() as lines:
-        observer.coded_under_deadline(controller, None)
         observer.coded_under_deadline(controller, Step(good, quick, 2.251))
+        controller.late = False
+        observer.coded_under_deadline(controller, None)
         observer.coded_under_deadline(controller, Step(quick, good, 1.0))
     assert [line["event"] for line in lines] == ["stepped down", "stepped up"]
     assert (lines[0]["before"], lines[0]["rung"]) == (good.rung.name, quick.rung.name)
     assert lines[0]["slowness"] == 2.25
+    assert value("rung") == controller.position == 1
+    assert value("rung_steps_total", direction="down") == 1
+    assert value("rung_steps_total", direction="up") == 1
+    assert value("deadline_missed_frames_total") == 1
+
+
+# --- metrics
+
+
+def test_an_acknowledged_picture_is_counted_with_its_bytes_and_times(
+    observer: DriveObserver, value: Value, acked: FrameResult
+) -> None:
+    observer.ended(acked)
+    assert value("frames_total", result="acked", reason="") == 1
+    assert value("payload_bytes_total", references="render") == 100
+    assert value("sent_bytes_total") == 340
+    for stage, spent_s in (("render", 0.01), ("encode", 0.02), ("link", 0.04)):
+        assert value("stage_seconds_sum", stage=stage) == spent_s
+    assert value("capture_to_ack_seconds_sum") == 0.08
+
+
+def test_a_lost_connection_is_counted_and_shown(observer: DriveObserver, value: Value) -> None:
+    observer.connected(True)
+    assert value("connected") == 1
+    observer.connected(False)
+    assert value("connected") == 0
+    assert value("connections_lost_total") == 1
+
+
+def test_a_vehicle_is_named_only_when_asked(metrics: AgentMetrics, value: Value) -> None:
+    named = {"vehicle": "cav-7", "camera": "front"}
+    assert value("info", **named) is None
+    metrics.identify("cav-7", "front")
+    assert value("info", **named) == 1
+
+
+@pytest.mark.parametrize("outcome", list(Outcome))
+@pytest.mark.parametrize("problem", ["", "no answer to a frame within 1.4 s", "000123.png: gone"])
+def test_the_labels_of_a_frame_are_its_outcome_and_a_word_for_the_reason(
+    registry: CollectorRegistry,
+    metrics: AgentMetrics,
+    make_capture: Callable[..., Capture],
+    outcome: Outcome,
+    problem: str,
+) -> None:
+    """Whatever the problem says, a reason is one of a closed set."""
+    reasons: list[EndReason | RejectReason] = [*EndReason, *RejectReason]
+    for reason in reasons:
+        metrics.ended(FrameResult(make_capture(0), outcome, reason, problem))
+    labels = [
+        sample.labels
+        for family in registry.collect()
+        for sample in family.samples
+        if sample.name == "rfedge_agent_frames_total"
+    ]
+    assert {entry["result"] for entry in labels} == {str(outcome)}
+    assert {entry["reason"] for entry in labels} == {str(reason) for reason in reasons}
+    assert all(re.fullmatch("[a-z_]*", entry["reason"]) for entry in labels)

@@ -8,17 +8,16 @@ from pathlib import Path
 import pytest
 from prometheus_client import CollectorRegistry
 
-from cav_agent.client import CameraTaken, StreamObserver
+from cav_agent.capture_schedule import recorded_schedule
+from cav_agent.client import CameraTaken, StreamOwner
 from cav_agent.config import AgentConfig, AgentLimits, PaceKind
 from cav_agent.frame_log import DriveObserver
-from cav_agent.frames import Capture, EndReason, FrameResult, Outcome, RetryReason
+from cav_agent.frames import Capture, EndReason, FrameResult, Outcome
 from cav_agent.handover import ServedTile
-from cav_agent.handover_controller import HandoverController
+from cav_agent.handover_controller import HandoverController, OpenStream, TileStream
 from cav_agent.metrics import AgentMetrics
-from cav_agent.tile_stream import OpenStream, TileStream
 from rfcore.errors import FieldFormatError, ProtocolError, RfedgeError
 from rfcore.wire.address import Address
-from rfcore.wire.notices import StreetNotice
 from rfcore.wire.tiles import Area, Tile
 
 REFUSED = ProtocolError("hello.field_ids: none is here")
@@ -38,11 +37,11 @@ class MemoryClient:
     """Stands for ``StreamClient``: acknowledges every picture as soon as it is captured."""
 
     rate_limit_hz = 0.0
-    is_sent_away = False
+    is_draining = False
 
     def __init__(
         self,
-        observer: StreamObserver,
+        owner: StreamOwner,
         make_capture: Callable[..., Capture],
         error: Exception | None,
         on_capture: Callable[[int], None],
@@ -51,7 +50,7 @@ class MemoryClient:
         self.left_behind: list[Capture] = []
         self.is_streaming = error is None
         self.withdrawn = False
-        self._observer = observer
+        self._owner = owner
         self._make_capture = make_capture
         self._error = error
         self._on_capture = on_capture
@@ -66,7 +65,7 @@ class MemoryClient:
         self.captured.append(index)
         self._on_capture(index)
         result = FrameResult(self._make_capture(index), Outcome.ACKED)
-        asyncio.get_running_loop().call_soon(self._observer.ended, result)
+        asyncio.get_running_loop().call_soon(self._owner.ended, result)
 
     def withdraw(self) -> None:
         self.withdrawn = True
@@ -80,12 +79,12 @@ class MemoryClient:
     def abandon(self, problem: str) -> None:
         for capture in self.left_behind:
             lost = FrameResult(capture, Outcome.LOST, EndReason.ABANDONED, problem)
-            self._observer.ended(lost)
+            self._owner.ended(lost)
 
     async def run(self) -> None:
-        self._observer.connected(self.is_streaming)
         if self._error is not None:
             raise self._error
+        self._owner.welcomed()
         await self._finishing.wait()
         await self.may_close.wait()
         if self._error is not None:
@@ -95,6 +94,19 @@ class MemoryClient:
         """End the stream from the server's side."""
         self._error = error
         self.finish()
+
+
+@dataclass
+class Owner:
+    """Owns a stream, and keeps how its pictures ended."""
+
+    results: list[FrameResult] = field(default_factory=list)
+
+    def ended(self, result: FrameResult) -> None:
+        self.results.append(result)
+
+    def welcomed(self) -> None:
+        """Not looked at."""
 
 
 @dataclass
@@ -109,8 +121,8 @@ class Site:
     """Who had a stream when a picture was captured."""
     breaks_at: int | None = None
     """The picture at which the stream that takes it is refused, once it was answered."""
-    sends_away_at: int | None = None
-    """The picture at which the server of the stream that takes it asks to be left."""
+    drains_at: int | None = None
+    """The picture at which the server of the stream that takes it begins to drain."""
     failing: int = 0
     """How many streams after a tile's first one are refused at once."""
 
@@ -118,12 +130,12 @@ class Site:
         if served in self.failing_fields:
             raise self.failing_fields[served]
 
-        def open_stream(observer: StreamObserver) -> MemoryClient:
+        def open_stream(owner: StreamOwner) -> MemoryClient:
             error = self.errors.get(served)
             if served in self.clients and self.failing:
                 self.failing -= 1
                 error = REFUSED
-            client = MemoryClient(observer, self.make_capture, error, self._note_streaming)
+            client = MemoryClient(owner, self.make_capture, error, self._note_streaming)
             self.clients.setdefault(served, []).append(client)
             return client
 
@@ -134,9 +146,9 @@ class Site:
             self.breaks_at = None
             (client,) = (c for clients in self.clients.values() for c in clients)
             client.break_off(REFUSED)
-        if index == self.sends_away_at:
+        if index == self.drains_at:
             (client,) = (c for clients in self.clients.values() for c in clients)
-            client.is_sent_away = True
+            client.is_draining = True
         self.streaming[index] = {
             served
             for served, clients in self.clients.items()
@@ -170,7 +182,10 @@ def drive(site: Site, registry: CollectorRegistry) -> Callable[..., HandoverCont
             limits=AgentLimits(give_up_s=give_up_s),
         )
         observer = DriveObserver(AgentMetrics(registry), ADDRESSES)
-        controller = HandoverController(config, POSITIONS, site.prepare, observer)
+        schedule = recorded_schedule(config, len(POSITIONS), 1)
+        controller = HandoverController(
+            config, POSITIONS, schedule, site.prepare, observer, asyncio.Event()
+        )
         for server in sorted({served.server for served in tiles}):
             mine = [served for served in tiles if served.server == server]
             controller.tiles_published(server, mine)
@@ -241,8 +256,8 @@ async def test_the_only_stream_that_fails_ends_the_drive_with_its_error(
 async def test_a_server_that_welcomed_the_vehicle_once_is_tried_again_for_ever(
     drive: Drive, site: Site, registry: CollectorRegistry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cav_agent.tile_stream.FIRST_RETRY_S", 0.001)
-    monkeypatch.setattr("cav_agent.tile_stream.LONGEST_RETRY_S", 0.001)
+    monkeypatch.setattr("cav_agent.handover_controller.FIRST_RETRY_S", 0.001)
+    monkeypatch.setattr("cav_agent.handover_controller.LONGEST_RETRY_S", 0.001)
     site.breaks_at, site.failing = 1, 3
     await drive(WEST, give_up_s=0.0).run()
     assert site.captured(WEST) == [0, 1, 2, 3]
@@ -251,11 +266,11 @@ async def test_a_server_that_welcomed_the_vehicle_once_is_tried_again_for_ever(
     assert retried == 4
 
 
-async def test_a_second_stream_to_the_same_tile_takes_over_where_its_server_asks_to_be_left(
+async def test_a_second_stream_to_the_same_tile_takes_over_where_its_server_is_draining(
     drive: Drive, site: Site
 ) -> None:
     """As behind a proxy, which places the second stream on another server."""
-    site.sends_away_at = 1
+    site.drains_at = 1
     await drive(WEST).run()
     first, second = site.clients[WEST]
     assert first.captured + second.captured == [0, 1, 2, 3]
@@ -266,7 +281,7 @@ async def test_a_second_stream_to_the_same_tile_takes_over_where_its_server_asks
 async def test_no_server_for_as_long_as_may_be_ends_the_drive(
     drive: Drive, site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cav_agent.tile_stream.FIRST_RETRY_S", 0.001)
+    monkeypatch.setattr("cav_agent.handover_controller.FIRST_RETRY_S", 0.3)
     site.errors[WEST] = RfedgeError("UNAVAILABLE")
     with pytest.raises(RfedgeError, match="UNAVAILABLE"):
         await drive(WEST, give_up_s=1.2).run()
@@ -294,26 +309,9 @@ async def test_a_camera_that_another_agent_sends_ends_the_drive_though_a_neighbo
 async def test_one_of_two_streams_that_fails_is_held_back_and_tried_again(
     site: Site, make_capture: Callable[..., Capture]
 ) -> None:
-    results: list[FrameResult] = []
-
-    class Observer:
-        def ended(self, result: FrameResult) -> None:
-            results.append(result)
-
-        def connected(self, is_connected: bool) -> None:
-            """Not looked at."""
-
-        def retrying(self, reason: RetryReason) -> None:
-            """Not looked at."""
-
-        def noticed(self, notice: StreetNotice) -> None:
-            pass
-
-        def message_unknown(self) -> None:
-            """Not looked at."""
-
+    owner = Owner()
     site.errors[WEST] = ProtocolError("draining")
-    stream = TileStream(WEST, site.prepare, Observer())
+    stream = TileStream(WEST, site.prepare, owner, asyncio.Event())
     stream.open(0.0)
     await asyncio.gather(*stream.tasks)
     assert stream.collect() is None
@@ -322,7 +320,7 @@ async def test_one_of_two_streams_that_fails_is_held_back_and_tried_again(
     client.left_behind.append(make_capture(1))
     await asyncio.gather(*stream.tasks, return_exceptions=True)
     assert isinstance(stream.collect(), ProtocolError)
-    assert [(r.capture.index, r.reason) for r in results] == [(1, EndReason.ABANDONED)]
+    assert [(r.capture.index, r.reason) for r in owner.results] == [(1, EndReason.ABANDONED)]
     assert stream.client is None
     stream.retry_at_s = 2.0
     stream.open(1.9)
@@ -342,23 +340,7 @@ async def test_a_field_is_prepared_once_for_all_streams_of_its_tile(site: Site) 
         prepared.append(served)
         return await site.prepare(served)
 
-    class Observer:
-        def ended(self, result: FrameResult) -> None:
-            raise AssertionError(result)
-
-        def connected(self, is_connected: bool) -> None:
-            """Not looked at."""
-
-        def retrying(self, reason: RetryReason) -> None:
-            """Not looked at."""
-
-        def noticed(self, notice: StreetNotice) -> None:
-            pass
-
-        def message_unknown(self) -> None:
-            """Not looked at."""
-
-    stream = TileStream(WEST, prepare, Observer())
+    stream = TileStream(WEST, prepare, Owner(), asyncio.Event())
     for _ in range(3):
         stream.prepare(0.0)
     await asyncio.gather(*stream.tasks)

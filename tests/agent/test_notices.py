@@ -34,8 +34,8 @@ async def test_every_reader_gets_a_line_for_each_notice(tmp_path: Path) -> None:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         pairs = [await asyncio.open_unix_connection(path) for _ in range(2)]
         await readers_are(told, 2)
-        told.tell(OBJECT)
-        told.tell(LIGHT)
+        told.send(OBJECT)
+        told.send(LIGHT)
         for reader, writer in pairs:
             first, second = [json.loads(await reader.readline()) for _ in range(2)]
             assert first == json.loads(json.dumps(notice_line(OBJECT, first["received_ns"])))
@@ -43,7 +43,7 @@ async def test_every_reader_gets_a_line_for_each_notice(tmp_path: Path) -> None:
             assert (second["kind"], second["light"], second["notice_id"]) == ("light", "dusk", 4)
             writer.close()
         await readers_are(told, 0)
-        told.tell(OBJECT)
+        told.send(OBJECT)
     assert not path.exists()
 
 
@@ -59,11 +59,11 @@ async def test_a_reader_that_does_not_read_is_let_go_and_the_others_go_on(
         await readers_are(told, 2)
         lines = 0
         while len(told._readers) == 2:
-            told.tell(OBJECT)
+            told.send(OBJECT)
             assert json.loads(await reader.readline())["notice_id"] == 3
             lines += 1
             assert lines < 100_000
-        told.tell(LIGHT)
+        told.send(LIGHT)
         assert json.loads(await reader.readline())["notice_id"] == 4
         writer.close()
         lazy.close()

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cav_agent.camera_poses import CameraLocation
 from cav_agent.deadline import FixedRung
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline, PipelineOptions, Stopwatch
@@ -19,7 +20,7 @@ from rfcore.codec.sender.ladder import Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, render_field_view
 from rfcore.image import I420, Rgb
-from rfcore.localise.estimate import LocalisationState, PoseEstimate
+from rfcore.localise.estimate import LocalisationState
 from rfcore.views import FieldView, View
 from rfcore.wire.messages import FrameAddress
 
@@ -118,25 +119,24 @@ class Places:
     def __init__(self) -> None:
         self.calls = 0
 
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> PoseEstimate:
-        del frame
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> CameraLocation:  # noqa: ARG002
         self.calls += 1
         if self.calls % 2:
-            return PoseEstimate(LocalisationState.LOCALISING, capture.capture_time_ns)
-        view = render_field_view(Grey(), capture.picture.camera.rounded(), rung.quality)
-        return PoseEstimate(LocalisationState.TRACKING, capture.capture_time_ns, view)
+            return CameraLocation(None, None, LocalisationState.LOCALISING)
+        camera = capture.picture.camera.rounded()
+        view = render_field_view(Grey(), camera, rung.quality)
+        return CameraLocation(camera, camera.world_from_cam, LocalisationState.TRACKING, view=view)
 
 
 def test_lost_frames_are_coded_without_the_field_and_found_ones_with_it(noisy: Capture) -> None:
-    config, options = CodecConfig(32, 16, effort="fast"), PipelineOptions(tracking=Places())
+    config, options = CodecConfig(32, 16, effort="fast"), PipelineOptions(poses=Places())
     pipeline = Pipeline(Grey(), config, lambda: 0, options)
     decoder = DeltaDecoder(pipeline.header)
     state, base = decoder.start(0), None
     for number, references in enumerate([(), None, (Reference.PREVIOUS,), None]):
         made = pipeline.encode(EncodeJob(noisy, 0, 1, base=base))
         lost = number % 2 == 0
-        assert made.fix is not None
-        assert (made.fix.world_from_cam is None) == lost
+        assert (made.pose is None) == lost
         assert references is None or made.packet.references == references
         camera = noisy.picture.camera
         view = FieldView.nothing(camera.intrinsics)
@@ -175,7 +175,7 @@ class RecordedRungs(FixedRung):
 
 def test_rungs_hear_which_frames_were_coded_without_the_field(noisy: Capture) -> None:
     rungs = RecordedRungs()
-    options = PipelineOptions(rungs=rungs, tracking=Places())
+    options = PipelineOptions(rungs=rungs, poses=Places())
     pipeline = Pipeline(Grey(), CodecConfig(32, 16, effort="fast"), StepClock(), options)
     for _ in range(4):
         pipeline.encode(EncodeJob(noisy, 0, 1))

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from cav_agent.rate_control import ByteBudget, QualitySteps, RateControl
 from cav_agent.session import AgentSession
+from rfcore.camera import Pose
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.references import RENDER_ONLY
@@ -92,7 +93,7 @@ class ModelCoder:
         digest, payload = b"d" * 16, bytes(size_bytes)
         packet = DeltaPacket(job.epoch, self.sequence, digest, b"", digest, payload, 0)
         self.sequence += 1
-        return EncodedFrame(packet, {"encode": CODING_S}, crf=crf)
+        return EncodedFrame(packet, {"encode": CODING_S}, Pose.identity(), crf=crf)
 
 
 class StreetCoder:
@@ -118,7 +119,7 @@ class StreetCoder:
         self._state, self._model = made.state, made.rate or self._model
         squares = np.mean((made.reconstruction.y.astype(float) - frame.y) ** 2)
         self.psnr_db[job.capture.index] = float(10 * np.log10(255**2 / squares))
-        return EncodedFrame(made.packet, {"encode": CODING_S}, made.tries, crf=made.crf)
+        return EncodedFrame(made.packet, {"encode": CODING_S}, made.pose, crf=made.crf)
 
 
 @dataclass

@@ -10,10 +10,10 @@ from random import Random
 import numpy as np
 import pytest
 
-from cav_agent.bit_division import BitDivision
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
-from cav_agent.rate_control import RateControl
+from cav_agent.rate_control import BitDivision, RateControl
 from cav_agent.session import AgentSession
+from rfcore.camera import Pose
 from rfcore.codec.packet import DeltaPacket
 from rfcore.link import LinkProfile
 from rfcore.link.shaper import Link
@@ -46,7 +46,7 @@ class ModelCoder:
         sequence = self.sequences[camera_id]
         self.sequences[camera_id] += 1
         packet = DeltaPacket(job.epoch, sequence, digest, b"", digest, payload, 0)
-        return EncodedFrame(packet, {"encode": CODING_S}, crf=crf)
+        return EncodedFrame(packet, {"encode": CODING_S}, Pose.identity(), crf=crf)
 
 
 class Drive:

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from attack.target import ROOT, SEED, VEHICLE, Target, all_of, for_ever, stream_of
-from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from mec_server.decoding.child import DECODER_NAME
 from rfcore.codec.h264.config import CodecConfig
@@ -34,17 +33,16 @@ def picture(target: Target, cameras: int = 1) -> tuple[Hello, Frame]:
     """Return a Hello, and a frame of its first camera that needs its render alone."""
     shown = read_dataset(ROOT / "samples/street/transforms_drive_vehicles.json").pictures[0]
     k = shown.camera.intrinsics
-    rounded = type(shown.camera)(k, shown.camera.world_from_cam.rounded())
-    shown = type(shown)(shown.name, rounded, shown.read)
+    shown = replace(shown, camera=shown.camera.rounded())
     field = load_field(ROOT / "samples/fields/street.rff")
     config = CodecConfig(k.width_px, k.height_px, "fast", ATTACKERS_CRF)
     pipeline = Pipeline(field, config, time.perf_counter_ns)
-    packet = pipeline.encode(EncodeJob(Capture(0, shown, 0.0, 0), 0, 1)).packet
+    packet = pipeline.encode_picture(shown)
     named = tuple(CameraDescription(f"c{i}", k, pipeline.header) for i in range(cameras))
     contract = RendererContract(RENDERER_CONTRACT, exact=True)
     prefix = bytes.fromhex(target.field_id)[:8]
     greeting = Hello(VEHICLE, named, (target.field_id,), contract)
-    return greeting, Frame("c0", 0, rounded.world_from_cam, prefix, packet)
+    return greeting, Frame("c0", 0, shown.camera.world_from_cam, prefix, packet)
 
 
 async def flipped_slices(target: Target) -> None:

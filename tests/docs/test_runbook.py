@@ -37,7 +37,7 @@ __all__ = ["serve", "street", "vehicle"]
 
 PAGE = Page("how-to/runbook.md")
 SERVE, ROLL, CANARY, PUBLISH, *SHARE, EVERYWHERE, ROLLBACK, BACKUP, RESTORE = PAGE.blocks("sh")
-PATIENT = AgentLimits(answer_s=60.0)
+PATIENT = AgentLimits(answer_s=60.0, stall_s=60.0)
 """A busy machine is not a server that is lost."""
 
 GROUND = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
@@ -119,7 +119,6 @@ class Operator:
 def desk(street: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Go to a folder with what the page starts from: published fields, a drive, another field."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     Path("fields").mkdir()
     publish(Path("fields"), "street", street.store / "street.rff", GROUND, datetime.now(UTC))
     Path("drive").symlink_to(street.drive)

@@ -19,7 +19,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ import numpy as np
 import pytest
 
 from attack.bystander import HZ as BYSTANDER_HZ
-from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from fault.streets import SHIPPED, SMALL, ShippedStreet, shipped_street
 from integration.conftest import (
@@ -414,13 +413,10 @@ def fault_free(street: Any, indices: Sequence[int]) -> list[str]:
     pipeline = Pipeline(street.field, config, time.perf_counter_ns)
     digests = []
     for sequence, index in enumerate(indices):
-        picture = pictures[index]
-        camera = picture.camera
-        rounded = type(camera)(camera.intrinsics, camera.world_from_cam.rounded())
-        picture = type(picture)(picture.name, rounded, picture.read)
+        picture = replace(pictures[index], camera=pictures[index].camera.rounded())
         base = FrameAddress("front", 0, sequence - 1) if sequence else None
-        job = EncodeJob(Capture(index, picture, 0.0, 0), 0, 1, base)
-        digests.append(pipeline.encode(job).packet.reconstruction_digest.hex())
+        packet = pipeline.encode_picture(picture, 0, base)
+        digests.append(packet.reconstruction_digest.hex())
     return digests
 
 

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from cav_agent.config import AgentConfig, PaceKind
-from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from cav_agent.vehicle import Vehicle
 from mec_server.config import RecordSettings, ServerConfig
@@ -173,8 +172,7 @@ def coded_small_street(street: Street) -> CodedStreet:
     prefix = bytes.fromhex(street.field_id)[:8]
     frames = []
     for i, picture in enumerate(pictures):
-        job = EncodeJob(Capture(i, picture, 0.0, i), 0, 1)
-        packet = pipeline.encode(job).packet
+        packet = pipeline.encode_picture(picture)
         frames.append(Frame("front", i, picture.camera.world_from_cam, prefix, packet))
     return CodedStreet(hello, frames)
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import grpc
-import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from cav_agent.config import AgentLimits
@@ -16,7 +15,7 @@ from rfcore.wire.messages import Ack, DrainNotice
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tiles import Area
 
-PATIENT = AgentLimits(answer_s=60.0)
+PATIENT = AgentLimits(answer_s=60.0, stall_s=60.0)
 """A busy machine is not a server that is lost."""
 
 EVERYWHERE = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
@@ -41,9 +40,8 @@ async def health(address: object) -> health_pb2.HealthCheckResponse.ServingStatu
 
 
 async def test_a_server_that_drains_hands_its_vehicle_over_without_a_lost_frame_or_a_keyframe(
-    street: Any, serve: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street: Any, serve: Any, vehicle: Any, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     async with (
         two_servers(street, serve, tmp_path) as (a, b, drained),
         vehicle(

@@ -48,7 +48,7 @@ pytestmark = pytest.mark.slow
 DEPLOY = Path(__file__).parents[2] / "deploy" / "envoy"
 VEHICLES, SERVERS = 12, 3
 MOST_OVER_MEAN = 1.5
-PATIENT = AgentLimits(answer_s=60.0)
+PATIENT = AgentLimits(answer_s=60.0, stall_s=60.0)
 """A busy machine is not a server that is lost."""
 
 EVERYWHERE = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
@@ -85,7 +85,6 @@ async def all_go_on(vehicles: list[Any]) -> None:
 async def test_envoy_places_streams_and_moves_them_when_a_server_dies_or_drains(
     street: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     publish_street(street, tmp_path)
     monkeypatch.chdir(tmp_path)
     setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", Path("envoy"))
@@ -150,10 +149,9 @@ vehicles here would wait for ``PATIENT.answer_s``."""
 
 
 async def test_vehicles_of_a_server_that_hangs_stream_again_elsewhere(
-    street: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street: Any, vehicle: Any, tmp_path: Path
 ) -> None:
     """A stopped process keeps its connections open and answers nothing."""
-    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     publish_street(street, tmp_path)
     setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", tmp_path / "envoy")
     async with AsyncExitStack() as stack:
@@ -185,9 +183,8 @@ async def test_vehicles_of_a_server_that_hangs_stream_again_elsewhere(
 
 
 async def test_a_server_that_says_not_serving_keeps_its_vehicles_and_gets_no_more(
-    street: Any, vehicle: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street: Any, vehicle: Any, serve: Any, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     publish_street(street, tmp_path)
     setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", tmp_path)
 
@@ -219,9 +216,8 @@ async def test_a_server_that_says_not_serving_keeps_its_vehicles_and_gets_no_mor
 
 
 async def test_over_mutual_tls_envoy_says_who_a_vehicle_is_and_nobody_else_can(
-    street: Any, vehicle: Any, coded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street: Any, vehicle: Any, coded: Any, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     publish_street(street, tmp_path)
     members = Members(("cav-1", "cav-raw", "thief"), proxies=("edge-proxy",))
     (tmp_path / "envoy").mkdir()
@@ -325,10 +321,9 @@ async def until_listed(address: str, field_id: str) -> None:
 
 
 async def test_each_group_takes_the_vehicles_of_its_tiles_and_none_falls_with_another(
-    street: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street: Any, vehicle: Any, tmp_path: Path
 ) -> None:
     """No group has the tile ``north``: the default one takes it."""
-    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     async with AsyncExitStack() as stack:
         groups = await asyncio.to_thread(Groups, street, tmp_path, stack)
         driving = {}

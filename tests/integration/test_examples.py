@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from cav_agent.pose_feed.json_lines import JsonParser
-from cav_agent.pose_feed.settings import PoseFeedSettings
+from cav_agent.pose_feed.sources import PoseFeedSettings
 from recorded import recorded
 from rfcore.camera import Pose
 from rfcore.dataset import read_dataset

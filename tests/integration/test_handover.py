@@ -121,10 +121,9 @@ def stays_ns(seen: list[TwinPicture | Departure]) -> list[tuple[int, int]]:
 
 
 async def test_a_vehicle_crosses_without_a_late_picture_or_a_keyframe(
-    roadside: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    roadside: Any, vehicle: Any, tmp_path: Path
 ) -> None:
     """A server that is slow because its machine is busy must not count as one that stalls."""
-    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", 60.0)
     a = await roadside("west", WEST, 0.0)
     b = await roadside("east", EAST, 2.0, -1.0, 0.5)
     at_a: list[TwinPicture | Departure] = []
@@ -135,7 +134,7 @@ async def test_a_vehicle_crosses_without_a_late_picture_or_a_keyframe(
     ]
     async with vehicle(
         a.address, neighbours=(b.address,), fields=tmp_path / "mine", loop=True,
-        limits=AgentLimits(answer_s=60.0),
+        limits=AgentLimits(answer_s=60.0, stall_s=60.0),
     ) as driving:  # fmt: skip
         await driving.until(lambda: driving.handovers("tile") >= 5)
         lines = driving.lines()  # a picture may wait when the drive is stopped, and is dropped

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from cav_agent.config import PaceKind
-from cav_agent.pose_feed.settings import PoseFeedSettings
+from cav_agent.pose_feed.sources import PoseFeedSettings
 from lab.localisation.pose_errors import PoseErrorModel
 from lab.localisation.pose_feed import FeedPlan, feed_lines, times_of
 from recorded import recorded

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cav_agent.pose_feed.settings import PoseFeedSettings
+from cav_agent.pose_feed.sources import PoseFeedSettings
 from lab.localisation.pose_feed import MakeFeed
 from recorded import recorded
 from rfcore.dataset import read_dataset

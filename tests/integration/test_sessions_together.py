@@ -62,7 +62,7 @@ class World:
         picture = PosedPicture(
             str(index), Camera(INTRINSICS, Pose.identity()), lambda: np.zeros((16, 32, 3), np.uint8)
         )
-        self.agent.offer(Capture(index, picture, self.now, index))
+        self.agent.offer(Capture("front", index, picture, self.now, index))
         self.agent.handle_timer(self.now)
         if self.agent.broken is not None:
             self.agent.connection_lost(self.agent.broken, self.now)
@@ -78,7 +78,7 @@ class World:
         payload = f"picture {job.capture.index}".encode()
         digest = zlib.crc32(payload).to_bytes(16, "big")
         packet = DeltaPacket(job.epoch, sequence, digest, b"c" * 64, digest, payload, 0)
-        return EncodedFrame(packet.sealed(), {})
+        return EncodedFrame(packet.sealed(), {}, Pose.identity())
 
     def exchange(self) -> None:
         for outgoing in self.agent.messages_to_send(self.now):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cav_agent.pose_feed.placing import Place
+from cav_agent.pose_feed import FieldPlacement
 from lab.localisation.pose_errors import PoseErrorModel
 from lab.localisation.pose_feed import FeedPlan, MakeFeed, feed_lines
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
@@ -180,7 +180,7 @@ def test_poses_that_were_found_tell_how_late_a_feed_is(tmp_path: Path, late_s: f
     file = tmp_path / "feed.jsonl"
     file.write_text("".join(text for _, text in feed_lines(poses, times_s, plan)))
     feed = RecordedFeed.read(file, 0.0)
-    place = Place(None, TileOrigin())
+    place = FieldPlacement(None, TileOrigin())
     feed.priors(pictures, place, Bounds((-99, -99, -99), (99, 99, 99)), 10.0)
     done = [
         replace(

@@ -7,7 +7,7 @@ from collections import Counter, deque
 import numpy as np
 import pytest
 
-from cav_agent.live.record import EndRecord, FrameRecord, Header, Record, record_of
+from cav_agent.live.reader import EndRecord, FrameRecord, Header, Record, record_of
 from cav_agent.live.source import LONGEST_PAUSE_S, OPENING_S, Clocks, LiveSource, SourceProblem
 from rfcore.errors import RfedgeError
 from rfcore.wire.sensing import ClockKind
@@ -39,11 +39,12 @@ class World:
         self.living += 1
         return FakeReader(self, deque(self._scripts.popleft() if self._scripts else ()))
 
-    def source_open(self, clock: ClockKind) -> None:
+    def source_open(self, camera_id: str, clock: ClockKind) -> None:
+        assert camera_id == "front"
         self.events.append(("open", clock))
 
-    def source_lost(self, problem: SourceProblem, text: str, begins: bool) -> None:
-        assert text
+    def source_lost(self, camera_id: str, problem: SourceProblem, text: str, begins: bool) -> None:
+        assert (camera_id, bool(text)) == ("front", True)
         self.counts["lost"] += 1
         if begins:
             self.events.append(("lost", problem))
@@ -54,7 +55,9 @@ class World:
 
     def source(self, **options: bool) -> LiveSource:
         clocks = Clocks(lambda: self.now_s, self.unix_ns, self.wait)
-        return LiveSource(self.open, SIZE_PX, self, timeout_s=5.0, clocks=clocks, **options)
+        return LiveSource(
+            self.open, "front", SIZE_PX, self, timeout_s=5.0, clocks=clocks, **options
+        )
 
     def run(self, source: LiveSource, until_s: float) -> None:
         while self.now_s < until_s and not source.is_over:

@@ -11,13 +11,15 @@ import av
 import numpy as np
 import pytest
 
-from cav_agent.frames import ClockKind
-from cav_agent.live.camera import open_camera
-from cav_agent.live.record import EndRecord, FrameRecord
+from cav_agent.config import AgentConfig
+from cav_agent.live.reader import EndRecord, FrameRecord
 from cav_agent.live.settings import LiveSettings, ReaderSettings
 from cav_agent.live.source import ReaderProcess, SourceProblem
+from cav_agent.live_cameras import LiveCameras, open_live_cameras
+from cav_agent.pose_feed.sources import PoseFeedSettings
 from rfcore.camera import TileOrigin
 from rfcore.errors import DatasetError, RfedgeError
+from rfcore.wire.sensing import ClockKind
 
 SIZE_PX = (64, 48)
 CAMERA = "[camera]\nwidth_px = 64\nheight_px = 48\nfx_px = 40.0\n"
@@ -31,10 +33,16 @@ class Events:
         self.lost: list[tuple[SourceProblem, str]] = []
         self.taken = 0
 
-    def source_open(self, clock: ClockKind) -> None:
-        assert clock is ClockKind.ARRIVAL
+    def source_open(self, camera_id: str, clock: ClockKind) -> None:
+        assert (camera_id, clock) == ("front", ClockKind.ARRIVAL)
 
-    def source_lost(self, problem: SourceProblem, text: str, begins: bool) -> None:
+    def source_lost(
+        self,
+        camera_id: str,  # noqa: ARG002
+        problem: SourceProblem,
+        text: str,
+        begins: bool,
+    ) -> None:
         assert begins or self.lost
         self.lost.append((problem, text))
 
@@ -68,6 +76,11 @@ def video(tmp_path: Path) -> Path:
 
 def settings_of(video: Path, **more: Any) -> LiveSettings:
     return LiveSettings(str(video), video.parent, **more)
+
+
+def opened(video: Path, events: Events, **more: Any) -> LiveCameras:
+    config = AgentConfig("127.0.0.1:1", live=settings_of(video), **more)
+    return open_live_cameras(config, None, events)
 
 
 def read_all(settings: LiveSettings, rate_hz: float) -> tuple[list[FrameRecord], EndRecord]:
@@ -110,7 +123,7 @@ def test_what_is_no_video_is_said_in_words(video: Path) -> None:
 
 def test_frames_get_the_poses_of_their_times_and_the_drive_ends(video: Path) -> None:
     events = Events()
-    live = open_camera(settings_of(video), 10.0, events, has_feed=False)
+    live = opened(video, events)
     poses = live.poses(TileOrigin(1.0, 2.0, 3.0))
     assert poses is not None
     assert live.positions == ((1.0, 2.0), (10.0, 2.0))
@@ -121,7 +134,7 @@ def test_frames_get_the_poses_of_their_times_and_the_drive_ends(video: Path) -> 
             if index is None:
                 time.sleep(0.002)
                 continue
-            capture = live.pictures.capture(index)
+            (capture,) = live.take(index)
             assert capture.clock is ClockKind.ARRIVAL
             picture_index = round(capture.picture.time_ns / 1e8)
             assert abs(float(capture.picture.read().mean()) - grey_of(picture_index)) < 3
@@ -143,19 +156,19 @@ def test_frames_get_the_poses_of_their_times_and_the_drive_ends(video: Path) -> 
 def test_without_poses_a_live_camera_is_refused(video: Path) -> None:
     (video.parent / "camera.toml").write_text(CAMERA)
     with pytest.raises(RfedgeError, match="nothing says where the camera is"):
-        open_camera(settings_of(video), 10.0, Events(), has_feed=False)
-    open_camera(settings_of(video), 10.0, Events(), has_feed=True).close()
+        opened(video, Events())
+    opened(video, Events(), feed=PoseFeedSettings("udp:127.0.0.1:0")).close()
 
 
 def test_a_lens_is_taken_out_by_the_vehicle(video: Path) -> None:
     (video.parent / "camera.toml").write_text(CAMERA + 'model = "OPENCV"\nk1 = -0.2\n' + POSES)
-    live = open_camera(settings_of(video), 10.0, Events(), has_feed=False)
+    live = opened(video, Events())
     try:
-        assert live.pictures.intrinsics.fx_px != 40.0
+        assert live.cameras[0].intrinsics.fx_px != 40.0
         while live.schedule.next_capture(time.monotonic()) is None:
             time.sleep(0.002)
-        capture = live.pictures.capture(0)
-        assert capture.picture.camera.intrinsics == live.pictures.intrinsics
+        (capture,) = live.take(0)
+        assert capture.picture.camera.intrinsics == live.cameras[0].intrinsics
         assert capture.picture.read().shape == (48, 64, 3)
     finally:
         live.close()

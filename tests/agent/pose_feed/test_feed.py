@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cav_agent.pose_feed.checks import NS, QUIET_S
-from cav_agent.pose_feed.feed import FieldFeed, PoseFeed, TimeOffsetEstimator
+from cav_agent.pose_feed.feed import NS, QUIET_S, PoseFeed
+from cav_agent.pose_feed.feed_poses import FeedPoses, TimeOffsetEstimator
 from cav_agent.pose_feed.fix import FeedProblem, Fix
-from cav_agent.pose_feed.placing import CameraMount, Place
-from cav_agent.pose_feed.settings import FeedSource, PoseFeedSettings, SourceKind, parse_source
+from cav_agent.pose_feed.placement import CameraMount, FieldPlacement
+from cav_agent.pose_feed.sources import FeedKind, FeedSource, PoseFeedSettings, parse_source
 from lab.localisation.pose_errors import ERROR_MODELS, PoseErrorModel
 from lab.localisation.pose_feed import FeedPlan, feed_lines
 from rfcore.camera import Pose, TileOrigin
@@ -60,18 +60,18 @@ def give(feed: PoseFeed, seconds: float, *, late_s: float = 0.1, x_m: float = 0.
 
 def test_each_fix_is_measured_once_and_not_before_its_time(told):
     feed = PoseFeed(told)
-    reader = FieldFeed(feed, Place(None, TileOrigin()))
+    reader = FeedPoses(feed, FieldPlacement(None, TileOrigin()))
     for n in range(4):
         give(feed, n, x_m=5.0 * n)
-    first = reader.measurements(NOW_NS + NS)
+    first = reader.measurements_until(NOW_NS + NS)
     assert [m.position_m[0] for m in first] == [0.0, 5.0]
-    assert reader.measurements(NOW_NS + NS) == []
-    assert [m.time_ns for m in reader.measurements(NOW_NS + 9 * NS)] == [
+    assert reader.measurements_until(NOW_NS + NS) == []
+    assert [m.time_ns for m in reader.measurements_until(NOW_NS + 9 * NS)] == [
         NOW_NS + 2 * NS,
         NOW_NS + 3 * NS,
     ]
-    other = FieldFeed(feed, Place(None, TileOrigin()))
-    assert len(other.measurements(NOW_NS + 9 * NS)) == 4
+    other = FeedPoses(feed, FieldPlacement(None, TileOrigin()))
+    assert len(other.measurements_until(NOW_NS + 9 * NS)) == 4
     assert told.all == []
 
 
@@ -105,20 +105,20 @@ def test_a_jump_is_told_and_handed_on(told):
 )
 def test_another_clock_is_told_with_its_zone_and_taken_away(told, ahead_s, words):
     feed = PoseFeed(told)
-    reader = FieldFeed(feed, Place(None, TileOrigin()))
+    reader = FeedPoses(feed, FieldPlacement(None, TileOrigin()))
     for n in range(5):
         give(feed, n + ahead_s, late_s=0.2 - ahead_s)
     assert told.all == [FeedProblem.CLOCK]
     assert words in told.texts[0]
-    times_s = [(m.time_ns - NOW_NS) / NS for m in reader.measurements(NOW_NS + 9 * NS)]
+    times_s = [(m.time_ns - NOW_NS) / NS for m in reader.measurements_until(NOW_NS + 9 * NS)]
     assert times_s == pytest.approx([n + 0.2 for n in range(5)])
 
 
 def test_latency_below_two_seconds_is_not_taken_for_another_clock(told):
     feed = PoseFeed(told)
-    reader = FieldFeed(feed, Place(None, TileOrigin()))
+    reader = FeedPoses(feed, FieldPlacement(None, TileOrigin()))
     give(feed, 0.0, late_s=1.9)
-    assert [m.time_ns for m in reader.measurements(NOW_NS + 9 * NS)] == [NOW_NS]
+    assert [m.time_ns for m in reader.measurements_until(NOW_NS + 9 * NS)] == [NOW_NS]
     assert told.all == []
 
 
@@ -143,10 +143,10 @@ def test_a_feed_that_never_speaks_is_silent(told):
 
 def test_a_position_beyond_the_fields_bounds_is_told_and_left_out(told):
     feed = PoseFeed(told)
-    reader = FieldFeed(feed, Place(None, TileOrigin()), BOX)
+    reader = FeedPoses(feed, FieldPlacement(None, TileOrigin()), BOX)
     for n, x_m in enumerate((0.0, 190.0, 300.0, 0.0)):
         give(feed, 10.0 * n, x_m=x_m)
-    found = reader.measurements(NOW_NS + 99 * NS)
+    found = reader.measurements_until(NOW_NS + 99 * NS)
     assert [m.position_m[0] for m in found] == [0.0, 190.0, 0.0]
     assert told.begun == [FeedProblem.OUTSIDE]
 
@@ -162,7 +162,7 @@ def test_bad_lines_are_counted_and_the_next_one_is_used(told):
 def test_a_position_on_the_earth_needs_the_fields_anchor(told):
     feed = PoseFeed(told)
     feed.receive(b'{"time_s": 1700000000, "latitude_deg": 48, "longitude_deg": 11}\n', NOW_NS)
-    assert FieldFeed(feed, Place(None, TileOrigin())).measurements(NOW_NS) == []
+    assert FeedPoses(feed, FieldPlacement(None, TileOrigin())).measurements_until(NOW_NS) == []
     assert told.begun == [FeedProblem.NO_ANCHOR]
     assert "rfedge field anchor" in told.texts[0]
 
@@ -182,7 +182,7 @@ def fix(**changes) -> Fix:
 def test_a_camera_looks_along_the_heading_upright_and_stands_ahead_of_the_antenna(
     heading_deg, ahead
 ):
-    place = Place(ANCHOR, TileOrigin(), CameraMount((2.0, 0.0, 0.5)))
+    place = FieldPlacement(ANCHOR, TileOrigin(), CameraMount((2.0, 0.0, 0.5)))
     measured = place.measurement(fix(heading_deg=heading_deg), NOW_NS)
     turn = Pose((0.0, 0.0, 0.0), measured.rotation)
     assert turn.apply((0, 0, 1)) == pytest.approx(ahead, abs=1e-9)
@@ -200,7 +200,7 @@ def test_a_mount_turns_the_camera_to_the_left_then_down():
 
 
 def test_without_a_direction_the_lever_arm_is_doubt():
-    place = Place(ANCHOR, TileOrigin(), CameraMount((3.0, 0.0, 0.0)))
+    place = FieldPlacement(ANCHOR, TileOrigin(), CameraMount((3.0, 0.0, 0.0)))
     measured = place.measurement(fix(), NOW_NS)
     assert measured.rotation is None
     assert measured.position_m == pytest.approx((0, 0, 0), abs=1e-6)
@@ -209,7 +209,7 @@ def test_without_a_direction_the_lever_arm_is_doubt():
 
 def test_deviations_follow_the_axes_of_the_field():
     looking_north = quaternion_from_vector((-math.pi / 2, 0.0, 0.0))
-    place = Place(Anchor(48.137, 11.575, 519.0, looking_north), TileOrigin())
+    place = FieldPlacement(Anchor(48.137, 11.575, 519.0, looking_north), TileOrigin())
     assert place.measurement(fix(), NOW_NS).position_std_m == pytest.approx((1.0, 3.0, 2.0))
 
 
@@ -233,7 +233,9 @@ def test_what_the_generator_writes_comes_back_as_the_cameras_poses(form, turn, a
     feed = PoseFeed(told, recorded=True)
     for _, text in feed_lines(POSES, TIMES_S, plan):
         feed.receive(text.encode(), NOW_NS)
-    found = FieldFeed(feed, Place(anchor, origin, mount)).measurements(NOW_NS + 99 * NS)
+    found = FeedPoses(feed, FieldPlacement(anchor, origin, mount)).measurements_until(
+        NOW_NS + 99 * NS
+    )
     assert told.all == []
     assert len(found) == len(POSES)
     for measured, pose in zip(found, POSES, strict=True):
@@ -248,7 +250,9 @@ def test_nmea_of_the_generator_comes_back_with_position_and_heading(told):
     feed = PoseFeed(told, recorded=True)
     for _, text in feed_lines(POSES, TIMES_S, plan):
         feed.receive(text.encode(), NOW_NS)
-    found = FieldFeed(feed, Place(ANCHOR, TileOrigin())).measurements(NOW_NS + 99 * NS)
+    found = FeedPoses(feed, FieldPlacement(ANCHOR, TileOrigin())).measurements_until(
+        NOW_NS + 99 * NS
+    )
     assert told.all == []
     assert len(found) == len(POSES)
     for measured, pose in zip(found, POSES, strict=True):
@@ -303,9 +307,9 @@ def test_a_straight_drive_at_one_speed_does_not_tell_and_says_so():
 @pytest.mark.parametrize(
     ("text", "source"),
     [
-        ("udp:127.0.0.1:5000", FeedSource(SourceKind.UDP, host="127.0.0.1", port=5000)),
-        ("udp:[::1]:0", FeedSource(SourceKind.UDP, host="::1")),
-        ("gpsd:localhost", FeedSource(SourceKind.GPSD, host="localhost", port=2947)),
+        ("udp:127.0.0.1:5000", FeedSource(FeedKind.UDP, host="127.0.0.1", port=5000)),
+        ("udp:[::1]:0", FeedSource(FeedKind.UDP, host="::1")),
+        ("gpsd:localhost", FeedSource(FeedKind.GPSD, host="localhost", port=2947)),
     ],
 )
 def test_sources_are_parsed(text, source):

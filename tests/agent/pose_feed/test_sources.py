@@ -15,8 +15,7 @@ import pytest
 
 from cav_agent.pose_feed.feed import PoseFeed
 from cav_agent.pose_feed.fix import FeedProblem
-from cav_agent.pose_feed.settings import FeedSource, SourceKind
-from cav_agent.pose_feed.sources import FeedTask
+from cav_agent.pose_feed.sources import FeedKind, FeedSource, FeedTask
 from lab.localisation.pose_feed import sentence
 from rfcore.errors import InvalidInput
 
@@ -63,7 +62,7 @@ async def reading(source: FeedSource) -> AsyncIterator[Reading]:
 async def test_a_file_is_read_to_its_end_even_without_a_last_line_break(tmp_path: Path):
     file = tmp_path / "drive.nmea"
     file.write_bytes(sentences(5)[:-2])
-    made = Reading(FeedSource(SourceKind.FILE, file))
+    made = Reading(FeedSource(FeedKind.FILE, file))
     await made.task.run()
     assert made.feed.count == 5
     assert set(made.problems) <= {FeedProblem.CLOCK}
@@ -71,13 +70,13 @@ async def test_a_file_is_read_to_its_end_even_without_a_last_line_break(tmp_path
 
 async def test_a_file_that_is_not_there_ends_the_start(tmp_path: Path):
     with pytest.raises(OSError, match="nowhere"):
-        await Reading(FeedSource(SourceKind.FILE, tmp_path / "nowhere")).task.run()
+        await Reading(FeedSource(FeedKind.FILE, tmp_path / "nowhere")).task.run()
     with pytest.raises(InvalidInput, match="is no file"):
-        await Reading(FeedSource(SourceKind.FILE, tmp_path)).task.run()
+        await Reading(FeedSource(FeedKind.FILE, tmp_path)).task.run()
 
 
 async def test_datagrams_are_read_as_they_come():
-    async with reading(FeedSource(SourceKind.UDP, host="127.0.0.1")) as made:
+    async with reading(FeedSource(FeedKind.UDP, host="127.0.0.1")) as made:
         await asyncio.wait_for(made.task.opened.wait(), DEADLINE_S)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.sendto(sentences(1).strip(), made.task.address)
@@ -89,7 +88,7 @@ async def test_datagrams_are_read_as_they_come():
 
 async def test_a_serial_line_is_read_and_tried_again_after_it_was_pulled():
     ours, theirs = pty.openpty()
-    async with reading(FeedSource(SourceKind.SERIAL, Path(os.ttyname(theirs)))) as made:
+    async with reading(FeedSource(FeedKind.SERIAL, Path(os.ttyname(theirs)))) as made:
         await asyncio.wait_for(made.task.opened.wait(), DEADLINE_S)
         for n in range(3):
             os.write(ours, sentences(1, n))
@@ -102,7 +101,7 @@ async def test_a_serial_line_is_read_and_tried_again_after_it_was_pulled():
 async def test_a_path_that_is_no_serial_line_is_told(tmp_path: Path):
     file = tmp_path / "not-a-line"
     file.write_bytes(b"")
-    async with reading(FeedSource(SourceKind.SERIAL, file)) as made:
+    async with reading(FeedSource(FeedKind.SERIAL, file)) as made:
         await made.until(lambda: FeedProblem.LOST in made.problems)
     assert made.feed.count == 0
 
@@ -123,7 +122,7 @@ async def test_gpsd_is_asked_to_report_and_connected_to_again():
 
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
-    async with server, reading(FeedSource(SourceKind.GPSD, host="127.0.0.1", port=port)) as made:
+    async with server, reading(FeedSource(FeedKind.GPSD, host="127.0.0.1", port=port)) as made:
         await made.until(lambda: made.feed.count >= 2)
     assert asked[0].startswith(b'?WATCH={"enable":true')
     assert FeedProblem.LOST in made.problems
@@ -133,5 +132,5 @@ async def test_a_host_that_does_not_answer_is_told_and_does_no_harm():
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         port = unused.getsockname()[1]
-        async with reading(FeedSource(SourceKind.GPSD, host="127.0.0.1", port=port)) as made:
+        async with reading(FeedSource(FeedKind.GPSD, host="127.0.0.1", port=port)) as made:
             await made.until(lambda: FeedProblem.LOST in made.problems)

@@ -1,35 +1,41 @@
-"""What a sender knows of the frames it has encoded: which are unanswered, which were decoded.
+"""Pictures that wait for the encoder, and frames that wait for an answer.
 
-Parts of ``cav_agent.session``, without a clock: ``FramesInFlight`` holds the frames without an
-answer and knows when one is overdue (``AnswerTimeout``); ``PredictionChain`` numbers epochs and
-says which frame the next may be predicted from.
+These are parts of ``cav_agent.session``, without a clock.
 
-The kernel notices a silent partition once it has bytes that nobody acknowledges. A stopped server,
-or a middlebox that forwards nothing, acknowledges everything and answers nothing; only a timeout
-notices that. It adapts to the stream: ``STALL_S``, plus the time that the bytes in flight need at
-``SLOWEST_BPS``, plus twice the longest of the last answers.
+``WaitingInstants`` holds pictures until they are encoded. Pictures of one instant belong together:
+a newer instant takes the place of one that waits as a whole, and an instant that was begun is coded
+to its end before another begins. An instant begins when every camera in it may send. A camera that
+may not, while others may, is left out of the instants that follow until it may again, so what is
+wrong with one camera costs the others one instant at most. A single camera is a rig of one.
+
+``FramesInFlight`` holds the frames without an answer, and ``AnswerTimeout`` says when one is
+overdue. The kernel notices a silent partition once it has bytes that nobody acknowledges. But a
+stopped server, or a middlebox that forwards nothing, acknowledges everything and answers nothing;
+only a timeout notices that. It adapts to the stream: ``AgentLimits.stall_s``, plus the time that
+the bytes in flight need at ``SLOWEST_BPS``, plus twice the longest of the last answers.
+
+``PredictionChain`` numbers epochs and says which frame the next may be predicted from.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from cav_agent.frames import FrameResult
+from cav_agent.config import AgentLimits
+from cav_agent.frames import Capture, FrameResult
 from rfcore.errors import RejectReason
 from rfcore.wire.messages import Ack, FrameAddress, Nack
 
 __all__ = [
     "SLOWEST_BPS",
-    "STALL_S",
     "AnswerTimeout",
     "FrameInFlight",
     "FramesInFlight",
     "PredictionChain",
+    "WaitingInstants",
 ]
-
-STALL_S = 1.0
-"""How long a server may pause beyond its usual time."""
 
 SLOWEST_BPS = 0.3e6
 """A link that has collapsed to this rate still counts as one."""
@@ -37,11 +43,93 @@ SLOWEST_BPS = 0.3e6
 REMEMBERED_ANSWERS = 8
 
 
-class AnswerTimeout:
-    """How long to wait for an answer: at most ``longest_s``, which is also what the first gets."""
+class WaitingInstants:
+    """Keeps at most ``slots`` instants that have not begun.
 
-    def __init__(self, longest_s: float) -> None:
-        self._longest_s = longest_s
+    ``may_send``: returns whether a camera may send.
+    """
+
+    def __init__(self, slots: int, may_send: Callable[[str], bool]) -> None:
+        self._slots, self._may_send = slots, may_send
+        self._begun: deque[Capture] = deque()
+        self._waiting: deque[tuple[Capture, ...]] = deque()
+        self._left_out: set[str] = set()
+
+    def __bool__(self) -> bool:
+        return bool(self._begun or self._waiting)
+
+    @property
+    def waiting_since_s(self) -> float | None:
+        """When the oldest instant that has not begun was captured."""
+        return min(c.captured_s for c in self._waiting[0]) if self._waiting else None
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether pictures of an instant that was begun are left."""
+        return bool(self._begun)
+
+    def offer(self, captures: tuple[Capture, ...]) -> list[Capture]:
+        """Take the pictures of an instant; return those that it supersedes."""
+        superseded: list[Capture] = []
+        if self._begun and not any(self._may_send(c.camera_id) for c in self._begun):
+            superseded += self._drop_begun()
+        if len(self._waiting) >= self._slots:
+            late = self._waiting.popleft()
+            may = {capture.camera_id: self._may_send(capture.camera_id) for capture in late}
+            if any(may.values()):
+                self._left_out |= {camera_id for camera_id in may if not may[camera_id]}
+            superseded += late
+        self._waiting.append(captures)
+        return superseded
+
+    def startable(self) -> tuple[Capture, ...]:
+        """Return the pictures of the next instant that may begin; empty while none may."""
+        self._left_out = {c for c in self._left_out if not self._may_send(c)}
+        if self._begun or not self._waiting:
+            return ()
+        captures = self._waiting[0]
+        ready = tuple(c for c in captures if self._may_send(c.camera_id))
+        waited_for = {c.camera_id for c in captures} - {c.camera_id for c in ready}
+        return () if waited_for - self._left_out else ready
+
+    def begin(self) -> list[Capture]:
+        """Begin the instant of ``startable``; return its pictures that are left out."""
+        ready = self.startable()
+        captures = self._waiting.popleft()
+        self._begun.extend(ready)
+        begun = {capture.camera_id for capture in ready}
+        return [capture for capture in captures if capture.camera_id not in begun]
+
+    def next(self) -> Capture | None:
+        """Return, once, the next picture of the instant that was begun, if one may be sent."""
+        for place, capture in enumerate(self._begun):
+            if self._may_send(capture.camera_id):
+                del self._begun[place]
+                return capture
+        return None
+
+    def drop_oldest(self) -> list[Capture]:
+        """Remove the oldest instant that has not begun; return its pictures."""
+        return list(self._waiting.popleft())
+
+    def clear(self) -> list[Capture]:
+        """Remove everything; return the pictures."""
+        dropped = self._drop_begun()
+        while self._waiting:
+            dropped += self._waiting.popleft()
+        return dropped
+
+    def _drop_begun(self) -> list[Capture]:
+        dropped = list(self._begun)
+        self._begun.clear()
+        return dropped
+
+
+class AnswerTimeout:
+    """How long to wait for an answer: at most ``limits.answer_s``, as for the first one."""
+
+    def __init__(self, limits: AgentLimits) -> None:
+        self._limits = limits
         self._answers_s: deque[float] = deque(maxlen=REMEMBERED_ANSWERS)
 
     def reset(self) -> None:
@@ -55,9 +143,10 @@ class AnswerTimeout:
     def timeout_s(self, bytes_in_flight: int) -> float:
         """Return how long the answer to the newest of ``bytes_in_flight`` may take."""
         if not self._answers_s:
-            return self._longest_s
+            return self._limits.answer_s
         link_s = 8 * bytes_in_flight / SLOWEST_BPS
-        return min(self._longest_s, STALL_S + link_s + 2 * max(self._answers_s))
+        usual_s = link_s + 2 * max(self._answers_s)
+        return min(self._limits.answer_s, self._limits.stall_s + usual_s)
 
 
 @dataclass(frozen=True)
@@ -74,9 +163,9 @@ class FrameInFlight:
 class FramesInFlight:
     """The unanswered frames of one session, by address."""
 
-    def __init__(self, longest_answer_s: float) -> None:
+    def __init__(self, limits: AgentLimits) -> None:
         self._frames: dict[FrameAddress, FrameInFlight] = {}
-        self._timeout = AnswerTimeout(longest_answer_s)
+        self._timeout = AnswerTimeout(limits)
 
     def __len__(self) -> int:
         return len(self._frames)

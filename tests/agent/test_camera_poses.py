@@ -1,4 +1,4 @@
-"""Where a rig is, from its reference camera: measured, tracked, carried on, and lost."""
+"""Where a rig is, from its reference camera: measured, tracked, extrapolated, and lost."""
 
 import math
 from collections.abc import Callable
@@ -7,13 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cav_agent.frames import Capture, RigPose
-from cav_agent.rig_poses import DrivenRig, MeasuredRig, TrackedRig
+from cav_agent.camera_poses import (
+    CameraLocation,
+    MeasuredRigPoses,
+    PoseSource,
+    RecordedRigPoses,
+    RigPose,
+    TrackedRigPoses,
+)
+from cav_agent.frames import Capture
 from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
 from rfcore.codec.sender.ladder import FULL_RUNG, Rung
 from rfcore.image import I420
-from rfcore.localise.estimate import LocalisationState, PoseEstimate
-from rfcore.views import FieldView
+from rfcore.localise.estimate import LocalisationState
+from rfcore.localise.prior import PoseMeasurement
 
 MakeCapture = Callable[..., Capture]
 INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
@@ -28,7 +35,7 @@ def driving(seconds: float) -> Pose:
     return Pose((8.0 * seconds, 1.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half)))
 
 
-class Reference:
+class Reference(PoseSource):
     """Measures, or finds, the reference camera where ``driving`` has it; ``found``: or not."""
 
     def __init__(self) -> None:
@@ -38,12 +45,18 @@ class Reference:
         pose = camera_on_rig(driving(capture.capture_time_ns / NS), CAMERA_FROM_RIG)
         return Camera(INTRINSICS, pose)
 
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> PoseEstimate:
+    def time_ns(self, capture: Capture) -> int:
+        return capture.capture_time_ns
+
+    def measurements(self, capture: Capture) -> list[PoseMeasurement]:
+        raise NotImplementedError
+
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> CameraLocation:
         assert (frame, rung) == (GREY, FULL_RUNG)
         if not self.found:
-            return PoseEstimate(LocalisationState.LOST, capture.capture_time_ns)
-        view = replace(FieldView.nothing(INTRINSICS), camera=self.camera(capture))
-        return PoseEstimate(LocalisationState.TRACKING, capture.capture_time_ns, view)
+            return CameraLocation(None, None, LocalisationState.LOST)
+        camera = self.camera(capture)
+        return CameraLocation(camera, camera.world_from_cam, LocalisationState.TRACKING)
 
 
 @pytest.fixture
@@ -63,21 +76,21 @@ def apart_m(at: RigPose, seconds: float) -> float:
 
 def test_a_drive_has_the_rigs_pose_itself(make_capture: MakeCapture) -> None:
     pose = driving(1.0).rounded()
-    assert DrivenRig().at(replace(make_capture(0), world_from_rig=pose)) == RigPose(pose)
+    assert RecordedRigPoses().at(replace(make_capture(0), world_from_rig=pose)) == RigPose(pose)
 
 
 def test_a_measured_reference_camera_says_where_the_rig_is(at: Callable[[float], Capture]) -> None:
-    rig = MeasuredRig(Reference(), CAMERA_FROM_RIG)
+    rig = MeasuredRigPoses(Reference(), CAMERA_FROM_RIG)
     assert apart_m(rig.at(at(2.0)), 2.0) < 1e-5
 
 
-def test_what_was_found_in_one_camera_is_carried_to_the_others_times(
+def test_what_was_found_in_one_camera_is_extrapolated_to_the_others_times(
     at: Callable[[float], Capture],
 ) -> None:
     reference = Reference()
-    rig = TrackedRig(reference, CAMERA_FROM_RIG, DrivenRig())
+    rig = TrackedRigPoses(reference, CAMERA_FROM_RIG, RecordedRigPoses())
     for seconds in (1.0, 1.1):
-        rig.locate(at(seconds), GREY, FULL_RUNG)
+        rig.track(at(seconds), GREY, FULL_RUNG)
         assert apart_m(rig.at(at(seconds)), seconds) < 1e-5
     assert apart_m(rig.at(at(1.15)), 1.15) < 0.01, "half a frame later"
     assert apart_m(rig.at(at(1.05)), 1.05) < 0.01, "half a frame before"
@@ -85,10 +98,10 @@ def test_what_was_found_in_one_camera_is_carried_to_the_others_times(
 
 def test_where_the_reference_is_lost_the_rig_is(at: Callable[[float], Capture]) -> None:
     reference = Reference()
-    rig = TrackedRig(reference, CAMERA_FROM_RIG, DrivenRig())
-    rig.locate(at(1.0), GREY, FULL_RUNG)
+    rig = TrackedRigPoses(reference, CAMERA_FROM_RIG, RecordedRigPoses())
+    rig.track(at(1.0), GREY, FULL_RUNG)
     reference.found = False
-    rig.locate(at(1.1), GREY, FULL_RUNG)
+    rig.track(at(1.1), GREY, FULL_RUNG)
     assert rig.at(at(1.12)) == RigPose(None, LocalisationState.LOST)
 
 
@@ -96,7 +109,7 @@ def test_once_the_reference_is_gone_measured_poses_take_over(
     at: Callable[[float], Capture],
 ) -> None:
     reference = Reference()
-    rig = TrackedRig(reference, CAMERA_FROM_RIG, MeasuredRig(reference, CAMERA_FROM_RIG))
+    rig = TrackedRigPoses(reference, CAMERA_FROM_RIG, MeasuredRigPoses(reference, CAMERA_FROM_RIG))
     assert apart_m(rig.at(at(0.5)), 0.5) < 1e-5, "before it ever sent"
-    rig.locate(at(1.0), GREY, FULL_RUNG)
+    rig.track(at(1.0), GREY, FULL_RUNG)
     assert apart_m(rig.at(at(9.0)), 9.0) < 1e-4

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from cav_agent.frames import Capture
-from cav_agent.pose_feed.checks import NS
-from cav_agent.pose_feed.feed import FieldFeed, PoseFeed
-from cav_agent.pose_feed.following import LONGEST_CARRY_S, FollowedFeed
-from cav_agent.pose_feed.placing import Place
+from cav_agent.pose_feed.feed import NS, PoseFeed
+from cav_agent.pose_feed.feed_poses import LONGEST_CARRY_S, FeedPoses
+from cav_agent.pose_feed.placement import FieldPlacement
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import RfedgeError
 from rfcore.views import PosedPicture
@@ -21,23 +20,22 @@ CAMERA = Camera(Intrinsics(4, 4, 2, 2, 2, 2), Pose.identity())
 
 def capture(time_s: float) -> Capture:
     picture = PosedPicture("p", CAMERA, lambda: np.zeros((4, 4, 3), np.uint8), round(time_s * NS))
-    return Capture(round(10 * time_s), picture, 0.0, 77)
+    return Capture("front", round(10 * time_s), picture, 0.0, 77)
 
 
-def followed(*fixes: dict[str, object], recorded: bool = True) -> FollowedFeed:
+def followed(*fixes: dict[str, object], recorded: bool = True) -> FeedPoses:
     feed = PoseFeed(lambda *_: None, recorded=recorded)
     for fix in fixes:
         feed.receive(json.dumps({"y_m": 0, "z_m": 0, **fix}).encode() + b"\n", 0)
-    place = FieldFeed(feed, Place(None, TileOrigin()))
-    return FollowedFeed(place, recorded=recorded, rate_hz=10.0)
+    return FeedPoses(feed, FieldPlacement(None, TileOrigin()), rate_hz=10.0)
 
 
 def fix(time_s: float, x_m: float, **more: object) -> dict[str, object]:
     return {"time_s": time_s, "x_m": x_m, "quaternion": [1, 0, 0, 0], **more}
 
 
-def east_m(feed: FollowedFeed, time_s: float) -> float:
-    return feed.prior(capture(time_s)).world_from_cam.translation_m[0]
+def east_m(feed: FeedPoses, time_s: float) -> float:
+    return feed.prior(round(time_s * NS)).world_from_cam.translation_m[0]
 
 
 def test_between_sparse_fixes_the_last_velocity_is_carried_on_and_then_held():
@@ -55,8 +53,8 @@ def test_a_jump_is_no_velocity():
 
 def test_without_a_direction_the_last_one_stays():
     feed = followed(fix(1, 0.0), {"time_s": 2, "x_m": 1})
-    at_first = feed.prior(capture(1.0)).world_from_cam.rotation
-    assert feed.prior(capture(2.0)).world_from_cam.rotation == at_first
+    at_first = feed.prior(1 * NS).world_from_cam.rotation
+    assert feed.prior(2 * NS).world_from_cam.rotation == at_first
 
 
 @pytest.mark.parametrize("fixes", [(), (fix(5, 0.0),), ({"time_s": 0, "x_m": 1},)])
@@ -72,7 +70,7 @@ def test_a_drive_that_begins_again_reads_its_feed_again():
 
 
 def test_deviations_are_those_of_the_feed_without_an_unknown_height():
-    prior = followed(fix(0, 0.0, covariance_m2=[4, 9, 2500], rotation_std_deg=2)).prior(capture(0))
+    prior = followed(fix(0, 0.0, covariance_m2=[4, 9, 2500], rotation_std_deg=2)).prior(0)
     assert (prior.position_m, prior.rotation_deg) == (3.0, 2.0)
 
 

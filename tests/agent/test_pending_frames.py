@@ -1,25 +1,136 @@
-"""Frames without an answer: how long each may take, which a refusal is about, what comes next."""
+"""What waits for the encoder, what for an answer, and what the next frame is predicted from."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cav_agent.config import AgentLimits
 from cav_agent.frames import Capture, FrameResult, Outcome
-from cav_agent.frames_in_flight import (
+from cav_agent.pending_frames import (
     SLOWEST_BPS,
-    STALL_S,
     AnswerTimeout,
     FramesInFlight,
     PredictionChain,
+    WaitingInstants,
 )
 from rfcore.errors import RejectReason
 from rfcore.wire.messages import Ack, FrameAddress, Nack, StageTimes
 
+MakeCapture = Callable[..., Capture]
+LIMITS = AgentLimits(answer_s=5.0)
+CAMERAS = ("a", "b", "c")
+
+
+# --- pictures that wait for the encoder
+
+
+class World:
+    """Instants of three cameras, of which those in ``may`` may send."""
+
+    def __init__(self, make_capture: MakeCapture) -> None:
+        self.may = set(CAMERAS)
+        self.waiting = WaitingInstants(1, lambda camera_id: camera_id in self.may)
+        self._make = make_capture
+
+    def offer(self, instant: int) -> list[tuple[str, int]]:
+        captures = tuple(
+            replace(self._make(instant), camera_id=camera_id, instant=instant)
+            for camera_id in CAMERAS
+        )
+        return names(self.waiting.offer(captures))
+
+    def begin(self) -> list[tuple[str, int]] | None:
+        """Begin the next instant if it may; return what is left out of it."""
+        return names(self.waiting.begin()) if self.waiting.startable() else None
+
+    def take(self) -> tuple[str, int] | None:
+        capture = self.waiting.next()
+        return None if capture is None else (capture.camera_id, capture.instant)
+
+
+def names(captures: list[Capture]) -> list[tuple[str, int]]:
+    return [(capture.camera_id, capture.instant) for capture in captures]
+
+
+@pytest.fixture
+def world(make_capture: MakeCapture) -> World:
+    return World(make_capture)
+
+
+def test_an_instant_that_was_begun_is_finished_before_a_newer_one(world: World) -> None:
+    world.offer(1)
+    assert world.begin() == []
+    assert world.take() == ("a", 1)
+    assert world.offer(2) == []
+    assert world.begin() is None
+    assert [world.take(), world.take(), world.take()] == [("b", 1), ("c", 1), None]
+    assert world.begin() == []
+    assert world.take() == ("a", 2)
+
+
+def test_the_newest_instant_takes_the_place_of_one_that_waits_as_a_whole(world: World) -> None:
+    world.offer(1)
+    assert world.offer(2) == [("a", 1), ("b", 1), ("c", 1)]
+    assert world.begin() == []
+    assert world.take() == ("a", 2)
+
+
+def test_an_instant_waits_until_all_its_cameras_may_send(world: World) -> None:
+    world.may = {"a", "c"}
+    world.offer(1)
+    assert world.begin() is None
+    world.may.add("b")
+    assert world.begin() == []
+
+
+def test_a_camera_that_may_not_send_costs_the_others_one_instant(world: World) -> None:
+    world.may = {"a", "c"}
+    world.offer(1)
+    assert world.offer(2) == [("a", 1), ("b", 1), ("c", 1)]
+    for instant in (3, 4, 5):
+        assert world.begin() == [("b", instant - 1)]
+        assert [world.take(), world.take()] == [("a", instant - 1), ("c", instant - 1)]
+        assert world.offer(instant) == []
+    world.may.add("b")
+    assert world.begin() == []
+
+
+def test_a_link_on_which_none_may_send_leaves_nobody_out(world: World) -> None:
+    world.may = set()
+    world.offer(1)
+    world.offer(2)
+    world.may = {"a", "b"}
+    assert world.begin() is None
+    world.may = set(CAMERAS)
+    assert world.begin() == []
+
+
+def test_what_was_begun_gives_way_when_a_connection_was_lost(world: World) -> None:
+    world.offer(1)
+    world.begin()
+    world.take()
+    world.may = set()
+    assert world.offer(2) == [("b", 1), ("c", 1)]
+
+
+def test_clear_returns_everything(world: World) -> None:
+    world.offer(1)
+    world.begin()
+    world.take()
+    world.offer(2)
+    cleared = names(world.waiting.clear())
+    assert cleared == [("b", 1), ("c", 1), ("a", 2), ("b", 2), ("c", 2)]
+    assert not world.waiting
+
+
+# --- how long an answer may take
+
 
 def test_a_first_answer_may_take_the_longest_time_allowed() -> None:
-    timeout = AnswerTimeout(5.0)
+    timeout = AnswerTimeout(LIMITS)
     assert timeout.timeout_s(1000) == 5.0
     timeout.answered(0.05)
     timeout.reset()
@@ -27,16 +138,16 @@ def test_a_first_answer_may_take_the_longest_time_allowed() -> None:
 
 
 def test_a_small_frame_of_a_quick_server_is_given_up_after_little_more_than_a_second() -> None:
-    timeout = AnswerTimeout(5.0)
+    timeout = AnswerTimeout(LIMITS)
     timeout.answered(0.1)
-    assert timeout.timeout_s(3000) == pytest.approx(STALL_S + 0.08 + 0.2)
+    assert timeout.timeout_s(3000) == pytest.approx(LIMITS.stall_s + 0.08 + 0.2)
 
 
 @given(st.lists(st.floats(0, 3), min_size=1), st.integers(0, 200_000))
 def test_what_was_usual_and_what_the_slowest_link_takes_is_always_waited_for(
     usual_s: list[float], size_bytes: int
 ) -> None:
-    timeout = AnswerTimeout(5.0)
+    timeout = AnswerTimeout(LIMITS)
     for spent_s in usual_s:
         timeout.answered(spent_s)
     needed_s = 8 * size_bytes / SLOWEST_BPS + max(usual_s[-8:])
@@ -51,9 +162,9 @@ def address(sequence: int, epoch: int = 0) -> FrameAddress:
 
 
 @pytest.fixture
-def in_flight(make_capture: Callable[..., Capture]) -> FramesInFlight:
+def in_flight(make_capture: MakeCapture) -> FramesInFlight:
     """Three frames of 1 kB, encoded at seconds 1, 2 and 3; the longest wait is 5 s."""
-    frames = FramesInFlight(5.0)
+    frames = FramesInFlight(LIMITS)
     for sequence in range(3):
         result = FrameResult(make_capture(sequence), Outcome.LOST, packet_bytes=1000)
         frames.add(address(sequence), result, None, 1.0 + sequence)
@@ -68,23 +179,23 @@ def test_the_oldest_frame_is_overdue_first(in_flight: FramesInFlight) -> None:
 
 
 def test_without_frames_nothing_is_overdue() -> None:
-    empty = FramesInFlight(5.0)
+    empty = FramesInFlight(LIMITS)
     assert empty.timeout_at() is None
     assert empty.longest_wait_s(9.0) == 0.0
     assert len(empty) == 0
 
 
 def test_a_frame_may_take_longer_behind_others_on_a_slow_link(
-    make_capture: Callable[..., Capture],
+    make_capture: MakeCapture,
 ) -> None:
-    frames = FramesInFlight(60.0)
+    frames = FramesInFlight(AgentLimits(answer_s=60.0))
     large = FrameResult(make_capture(0), Outcome.LOST, packet_bytes=37_500)  # 1 s at the slowest
     frames.add(address(0), large, None, 0.0)
     frames.acked(Ack(address(0), StageTimes(), b""), 0.5)
     frames.pop(address(0))
     for sequence in (1, 2):
         frames.add(address(sequence), large, None, 10.0)
-    waits = [STALL_S + behind + 2 * 0.5 for behind in (1.0, 2.0)]
+    waits = [LIMITS.stall_s + behind + 2 * 0.5 for behind in (1.0, 2.0)]
     assert frames.timeout_at() == pytest.approx(10.0 + waits[0])
     frames.pop(address(1))
     assert frames.timeout_at() == pytest.approx(10.0 + waits[1])

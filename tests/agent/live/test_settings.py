@@ -7,8 +7,14 @@ from typing import Any
 import pytest
 
 from cav_agent.config import AgentConfig, PaceKind
-from cav_agent.live.address import SourceKind, parse_address, without_password
-from cav_agent.live.settings import LiveSettings, ReaderSettings, RtspTransport
+from cav_agent.live.settings import (
+    LiveSettings,
+    ReaderSettings,
+    RtspTransport,
+    SourceKind,
+    parse_address,
+    without_password,
+)
 from rfcore.errors import InvalidInput
 
 SIZE_PX = (640, 360)

@@ -1,7 +1,8 @@
-"""From the vehicle on the Earth to the camera in a field: anchor, lever arm, mounting.
+"""Transforms a vehicle's pose on the Earth to its camera's pose in a field.
 
 A vehicle's axes are x forward, y left, z up, with their origin where the feed's position is, such
-as the antenna. A heading is that of x, clockwise from north: the vehicle is taken to stand upright.
+as the antenna. A heading is that of x, clockwise from north; the vehicle is assumed to be upright.
+The lever arm and the mounting lead from there to the camera, the anchor to the field's axes.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from rfcore.geodesy import Anchor
 from rfcore.localise.prior import PoseMeasurement
 from rfcore.motion import quaternion_from_vector
 
-__all__ = ["CameraMount", "Place"]
+__all__ = ["CameraMount", "FieldPlacement"]
 
 LOOKING_FORWARD = Pose.from_matrix([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]])
 """vehicle_from_cam of a camera that looks along x."""
@@ -47,19 +48,19 @@ class CameraMount:
 
 
 @dataclass(frozen=True)
-class Place:
-    """A field's place: its anchor on the Earth, and its origin in the drives' global frame."""
+class FieldPlacement:
+    """Where a field lies: its anchor on the Earth, and its origin in the drives' global frame."""
 
     anchor: Anchor | None
     origin: TileOrigin
     mount: CameraMount = CameraMount()
 
     def measurement(self, fix: Fix, time_ns: int) -> PoseMeasurement:
-        """Return the pose of the camera that a fix measures, at ``time_ns`` of its clock.
+        """Return the camera's pose that a fix measures, at ``time_ns`` of the agent's clock.
 
-        Without heading and rotation the lever arm points anywhere: the position is that of the
-        vehicle, so much less certain. Raises ``InvalidInput`` for a position on the Earth where the
-        field has no anchor.
+        Without heading and rotation the lever arm may point anywhere: then the position is the
+        vehicle's, and its deviation grows by the arm's length. Raises ``InvalidInput`` for a
+        position on the Earth where the field has no anchor.
         """
         position_m, std_m = self._position(fix)
         mount = self.mount.vehicle_from_cam
@@ -92,7 +93,7 @@ class Place:
         if height_m is None:
             height_m = self.anchor.height_m
         position_m = self.anchor.world_from_geodetic(latitude_deg, longitude_deg, height_m)
-        world_from_enu = _only(self.anchor.turned_from_enu((1.0, 0.0, 0.0, 0.0)))
+        world_from_enu = _rotation_only(self.anchor.turned_from_enu((1.0, 0.0, 0.0, 0.0)))
         rows = world_from_enu.rotation_matrix()
         x, y, z = (
             math.hypot(*(r * s for r, s in zip(row, fix.position_std_m, strict=True)))
@@ -111,12 +112,12 @@ class Place:
         return self.anchor.turned_from_enu(rotation)
 
 
-def _only(rotation: tuple[float, float, float, float]) -> Pose:
+def _rotation_only(rotation: tuple[float, float, float, float]) -> Pose:
     return Pose((0.0, 0.0, 0.0), rotation)
 
 
 def _turned(vector_rad: Vec3) -> Pose:
-    return _only(quaternion_from_vector(vector_rad))
+    return _rotation_only(quaternion_from_vector(vector_rad))
 
 
 def _widened(std_m: Vec3, by_m: float) -> Vec3:
