@@ -23,7 +23,7 @@ from rfcore.field import RadianceField
 from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.wire.address import Address
 from rfcore.wire.notices import StreetNotice
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.values import ClockKind
 
 __all__ = ["DriveObserver", "log_line"]
 

@@ -18,7 +18,7 @@ from rfcore.errors import RejectReason
 from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.views import PosedPicture
 from rfcore.wire.messages import FrameAddress, StageTimes
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.values import ClockKind
 
 __all__ = [
     "Capture",

@@ -37,7 +37,7 @@ from cav_agent.live.reader import HEADER_BYTES, EndRecord, FrameRecord, Header, 
 from cav_agent.live.settings import ReaderSettings
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import Rgb
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.values import ClockKind
 
 __all__ = [
     "CaptureClock",

@@ -8,16 +8,13 @@ that concerns a single frame raises ``FrameRefused``, which holds the address to
 from __future__ import annotations
 
 from array import array
-from functools import lru_cache
-from typing import cast
 
 from google.protobuf.message import DecodeError
 
-from rfcore.camera import Intrinsics, Pose
+from rfcore.camera import Pose
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
-from rfcore.codec.references import Reference, References
 from rfcore.errors import InvalidInput
 from rfcore.field.quality import FULL, Quality
 from rfcore.wire.checks import (
@@ -42,13 +39,21 @@ from rfcore.wire.messages import (
     Hello,
     RendererContract,
 )
-from rfcore.wire.sensing import (
+from rfcore.wire.v1 import edge_pb2 as pb
+from rfcore.wire.values import (
     clock_from_wire,
     clock_to_wire,
+    intrinsics_from_wire,
+    intrinsics_to_wire,
     localisation_from_wire,
     localisation_to_wire,
+    pose_from_wire,
+    pose_to_wire,
+    quality_from_wire,
+    quality_to_wire,
+    references_from_wire,
+    references_to_wire,
 )
-from rfcore.wire.v1 import edge_pb2 as pb
 
 __all__ = [
     "FrameRefused",
@@ -56,8 +61,6 @@ __all__ = [
     "client_message_from_wire",
     "client_message_to_bytes",
     "client_message_to_wire",
-    "quality_of",
-    "quality_to_wire",
 ]
 
 
@@ -127,7 +130,7 @@ def _hello_from_wire(hello: pb.Hello) -> Hello:
 def _camera_from_wire(field: str, camera: pb.CameraDescription) -> CameraDescription:
     k, header = camera.intrinsics, camera.codec
     try:
-        intrinsics = Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px)
+        intrinsics = intrinsics_from_wire(k)
         codec = _codec_from_wire(header)
     except InvalidInput as error:
         raise InvalidInput(f"{field}.{error.field}", error.problem) from error
@@ -150,7 +153,7 @@ def _extrinsics_from_wire(field: str, camera: pb.CameraDescription) -> Pose | No
     if not camera.HasField("camera_from_rig"):
         return None
     try:
-        pose = _pose_of(camera.camera_from_rig)
+        pose = pose_from_wire(camera.camera_from_rig)
     except InvalidInput as error:
         raise InvalidInput(f"{field}.{error.field}", error.problem) from error
     for axis, metres in zip("xyz", pose.translation_m, strict=True):
@@ -178,17 +181,10 @@ def _hello_to_wire(hello: Hello) -> pb.Hello:
 
 
 def _camera_to_wire(camera: CameraDescription) -> pb.CameraDescription:
-    k, config = camera.intrinsics, camera.codec.config
+    config = camera.codec.config
     return pb.CameraDescription(
         camera_id=camera.camera_id,
-        intrinsics=pb.Intrinsics(
-            width_px=k.width_px,
-            height_px=k.height_px,
-            fx_px=k.fx_px,
-            fy_px=k.fy_px,
-            cx_px=k.cx_px,
-            cy_px=k.cy_px,
-        ),
+        intrinsics=intrinsics_to_wire(camera.intrinsics),
         codec=pb.StreamHeader(
             width_px=config.width_px,
             height_px=config.height_px,
@@ -198,7 +194,7 @@ def _camera_to_wire(camera: CameraDescription) -> pb.CameraDescription:
             pps=camera.codec.pps,
         ),
         rate_hz=camera.rate_hz,
-        camera_from_rig=None if camera.camera_from_rig is None else _double(camera.camera_from_rig),
+        camera_from_rig=pose_to_wire(camera.camera_from_rig) if camera.camera_from_rig else None,
     )
 
 
@@ -225,19 +221,9 @@ def _frame_from_wire(frame: pb.Frame) -> Frame:
     )
 
 
-def quality_of(quality: pb.Quality) -> Quality:
-    """Return a checked quality; ``Quality`` itself refuses what is not on the ladder."""
-    return Quality(
-        (quality.detail_percent or 100) / 100,
-        quality.sh_degree if quality.HasField("sh_degree") else None,
-        quality.samples_per_ray or None,
-        (quality.scale_percent or 100) / 100,
-    )
-
-
 def _quality_from_wire(quality: pb.Quality) -> Quality:
     try:
-        return quality_of(quality)
+        return quality_from_wire(quality)
     except InvalidInput as error:
         raise InvalidInput(f"frame.{error.field}", error.problem) from error
 
@@ -248,7 +234,7 @@ def _pose_from_wire(frame: pb.Frame) -> Pose | None:
         return None
     if frame.HasField("pose"):
         check_range("frame.pose_f32", len(frame.pose_f32), 0, 0)
-        checked = _pose_of(frame.pose)
+        checked = pose_from_wire(frame.pose)
     else:
         check_range("frame.pose_f32", len(frame.pose_f32), 7, 7)
         x_m, y_m, z_m, w, x, y, z = frame.pose_f32
@@ -258,10 +244,6 @@ def _pose_from_wire(frame: pb.Frame) -> Pose | None:
     check_range("pose.y_m", y_m, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
     check_range("pose.z_m", z_m, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
     return checked
-
-
-def _pose_of(p: pb.Pose) -> Pose:
-    return Pose((p.x_m, p.y_m, p.z_m), (p.rotation_w, p.rotation_x, p.rotation_y, p.rotation_z))
 
 
 def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
@@ -275,7 +257,7 @@ def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
             reconstruction_digest=frame.reconstruction_digest,
             payload=check_bytes("frame.payload", frame.payload, 0, MAX_PAYLOAD_BYTES),
             crc32=frame.crc32,
-            references=_references_from_wire(tuple(frame.references)),
+            references=references_from_wire("frame.references", tuple(frame.references)),
             base_digest=frame.base_digest,
             photometric=tuple(frame.photometric),
             relit=frame.relit,
@@ -283,14 +265,6 @@ def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
         )
     except InvalidInput as error:
         raise InvalidInput(error.field.replace("packet.", "frame.", 1), error.problem) from error
-
-
-@lru_cache(maxsize=64)
-def _references_from_wire(numbers: tuple[int, ...]) -> References:
-    try:
-        return tuple(Reference(number) for number in numbers)
-    except ValueError as error:
-        raise InvalidInput("frame.references", f"{error}; update this end") from error
 
 
 def _frame_to_wire(frame: Frame) -> pb.Frame:
@@ -301,7 +275,7 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
         sequence=packet.sequence,
         capture_time_ns=frame.capture_time_ns,
         field_id_prefix=frame.field_id_prefix,
-        references=[cast(pb.Reference.ValueType, int(r)) for r in packet.references],
+        references=references_to_wire(packet.references),
         render_digest=packet.render_digest,
         render_block_means=packet.render_block_means,
         reconstruction_digest=packet.reconstruction_digest,
@@ -321,16 +295,6 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
     return message
 
 
-def quality_to_wire(quality: Quality) -> pb.Quality:
-    """Return a quality as protobuf."""
-    return pb.Quality(
-        detail_percent=0 if quality.detail == 1 else round(100 * quality.detail),
-        sh_degree=quality.sh_degree,
-        samples_per_ray=quality.samples_per_ray or 0,
-        scale_percent=0 if quality.scale == 1 else round(100 * quality.scale),
-    )
-
-
 def _add_pose(message: pb.Frame, pose: Pose | None) -> None:
     """Put the pose in, if there is one, in 4 bytes a number if that keeps every bit."""
     if pose is None:
@@ -339,12 +303,4 @@ def _add_pose(message: pb.Frame, pose: Pose | None) -> None:
     if tuple(array("f", numbers)) == numbers:
         message.pose_f32.extend(numbers)
         return
-    message.pose.CopyFrom(_double(pose))
-
-
-def _double(pose: Pose) -> pb.Pose:
-    x_m, y_m, z_m = pose.translation_m
-    w, x, y, z = pose.rotation
-    return pb.Pose(
-        x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
-    )
+    message.pose.CopyFrom(pose_to_wire(pose))

@@ -16,7 +16,7 @@ from rfcore.field import FULL, Quality, Renderer, render_field_view
 from rfcore.localise.estimate import LocalisationState
 from rfcore.views import FieldView
 from rfcore.wire.notices import StreetNotice
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.values import ClockKind
 
 __all__ = [
     "Ack",

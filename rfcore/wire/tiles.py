@@ -8,7 +8,7 @@ server that publishes no tiles serves its fields everywhere.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_label, check_name, check_range
@@ -176,15 +176,7 @@ def learnt_message(learnt: LearntLight) -> pb.LearntLight:
 
 def learnt_of(message: pb.LearntLight) -> LearntLight:
     """Return what a server says it learnt; raise ``InvalidInput`` naming what is wrong with it."""
-    return LearntLight(
-        message.tile,
-        message.light,
-        message.field_id,
-        message.passes,
-        message.time_ms,
-        message.saved_ratio,
-        message.withdrawn,
-    )
+    return LearntLight(**{each.name: getattr(message, each.name) for each in fields(LearntLight)})
 
 
 def tile_message(tile: Tile) -> pb.Tile:

@@ -6,27 +6,32 @@ that is wrong ``ProtocolError``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, cast
+from typing import Final
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.codec.references import Reference, References
+from rfcore.codec.references import References
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.image import I420, Rgb, jpeg_bytes, png_bytes, rgb_from_bytes
 from rfcore.localise.estimate import LocalisationState
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.perception.objects import CameraKey
 from rfcore.wire.checks import check_name, check_range
-from rfcore.wire.sensing import (
+from rfcore.wire.v1 import twin_pb2
+from rfcore.wire.values import (
     ClockKind,
     clock_from_wire,
     clock_to_wire,
+    intrinsics_from_wire,
+    intrinsics_to_wire,
     localisation_from_wire,
     localisation_to_wire,
+    pose_from_wire,
+    pose_to_wire,
+    references_from_wire,
+    references_to_wire,
 )
-from rfcore.wire.v1 import edge_pb2, twin_pb2
 
 __all__ = [
     "MAX_WATCHED_VEHICLES",
@@ -38,9 +43,6 @@ __all__ = [
     "encoded_picture",
     "encoding_from_wire",
     "encoding_to_wire",
-    "intrinsics_to_wire",
-    "pose_from_wire",
-    "pose_to_wire",
     "subscription_from_wire",
     "subscription_to_wire",
     "twin_message_from_wire",
@@ -214,42 +216,14 @@ def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
         picture=message.picture,
         skipped=message.skipped,
         payload_bytes=message.payload_bytes,
-        references=[cast(edge_pb2.Reference.ValueType, int(r)) for r in message.references],
+        references=references_to_wire(message.references),
         capture_clock=clock_to_wire(message.clock),
         localisation=localisation_to_wire(message.localisation),
         instant=message.instant,
     )
 
 
-def intrinsics_to_wire(k: Intrinsics) -> edge_pb2.Intrinsics:
-    """Return intrinsics as protobuf."""
-    return edge_pb2.Intrinsics(
-        width_px=k.width_px,
-        height_px=k.height_px,
-        fx_px=k.fx_px,
-        fy_px=k.fy_px,
-        cx_px=k.cx_px,
-        cy_px=k.cy_px,
-    )
-
-
-def pose_to_wire(pose: Pose) -> edge_pb2.Pose:
-    """Return a pose as protobuf."""
-    x_m, y_m, z_m = pose.translation_m
-    w, x, y, z = pose.rotation
-    return edge_pb2.Pose(
-        x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
-    )
-
-
-def pose_from_wire(pose: edge_pb2.Pose) -> Pose:
-    """Return a pose; raise ``InvalidInput`` for one that is none."""
-    rotation = (pose.rotation_w, pose.rotation_x, pose.rotation_y, pose.rotation_z)
-    return Pose((pose.x_m, pose.y_m, pose.z_m), rotation)
-
-
 def _picture_from_wire(picture: twin_pb2.TwinPicture) -> TwinPicture:
-    pose, k = picture.pose, picture.intrinsics
     return TwinPicture(
         vehicle_id=check_name("picture.vehicle_id", picture.vehicle_id),
         camera_id=check_name("picture.camera_id", picture.camera_id),
@@ -258,26 +232,19 @@ def _picture_from_wire(picture: twin_pb2.TwinPicture) -> TwinPicture:
         sequence=picture.sequence,
         capture_time_ns=picture.capture_time_ns,
         age_ns=picture.age_ns,
-        pose=pose_from_wire(pose) if picture.HasField("pose") else None,
-        intrinsics=Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px),
+        pose=pose_from_wire(picture.pose) if picture.HasField("pose") else None,
+        intrinsics=intrinsics_from_wire(picture.intrinsics),
         field_id=picture.field_id,
         reconstruction_digest=picture.reconstruction_digest,
         encoding=encoding_from_wire(picture.encoding),
         picture=picture.picture,
         skipped=picture.skipped,
         payload_bytes=picture.payload_bytes,
-        references=_references_from_wire(picture.references),
+        references=references_from_wire("picture.references", tuple(picture.references)),
         clock=clock_from_wire(picture.capture_clock),
         localisation=localisation_from_wire(picture.localisation),
         instant=picture.instant,
     )
-
-
-def _references_from_wire(numbers: Iterable[int]) -> References:
-    try:
-        return tuple(Reference(number) for number in numbers)
-    except ValueError as error:
-        raise InvalidInput("picture.references", f"{error}; update this end") from error
 
 
 def encoding_to_wire(encoding: PictureEncoding) -> twin_pb2.PictureEncoding.ValueType:

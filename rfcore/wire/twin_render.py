@@ -23,17 +23,21 @@ from rfcore.wire.checks import (
     check_name,
     check_range,
 )
-from rfcore.wire.convert import quality_of, quality_to_wire
 from rfcore.wire.twin import (
     PictureEncoding,
     decoded_picture,
     encoding_from_wire,
     encoding_to_wire,
+)
+from rfcore.wire.v1 import twin_pb2 as pb
+from rfcore.wire.values import (
+    intrinsics_from_wire,
     intrinsics_to_wire,
     pose_from_wire,
     pose_to_wire,
+    quality_from_wire,
+    quality_to_wire,
 )
-from rfcore.wire.v1 import twin_pb2 as pb
 
 __all__ = [
     "DEFAULT_AGE_S",
@@ -184,14 +188,13 @@ def view_request_from_wire(request: pb.RenderRequest) -> ViewRequest:
     """Return what a consumer asks for; raise ``InvalidInput`` for a value outside its limits."""
     if not (request.HasField("pose") and request.HasField("intrinsics")):
         raise InvalidInput("pose", "a view needs a pose and intrinsics")
-    k = request.intrinsics
-    intrinsics = Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px)
+    intrinsics = intrinsics_from_wire(request.intrinsics)
     jpeg = request.encoding == pb.PICTURE_ENCODING_UNSPECIFIED
     return ViewRequest(
         Camera(intrinsics, pose_from_wire(request.pose)),
         request.tile,
         request.field_id,
-        quality_of(request.quality) if request.HasField("quality") else FULL,
+        quality_from_wire(request.quality) if request.HasField("quality") else FULL,
         PictureEncoding.JPEG if jpeg else encoding_from_wire(request.encoding),
         (request.max_age_ms / 1e3) or DEFAULT_AGE_S,
         request.number,

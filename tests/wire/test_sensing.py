@@ -7,7 +7,7 @@ import pytest
 from rfcore.localise.estimate import LocalisationState
 from rfcore.wire.convert import client_message_from_wire, client_message_to_wire
 from rfcore.wire.messages import Frame
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.values import ClockKind
 
 
 @pytest.mark.parametrize("clock", [None, *ClockKind])

@@ -10,7 +10,6 @@ from rfcore.codec.references import Reference
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.field.quality import FULL, Quality
 from rfcore.localise.estimate import LocalisationState
-from rfcore.wire.sensing import ClockKind
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -38,6 +37,7 @@ from rfcore.wire.twin_render import (
     view_request_to_wire,
 )
 from rfcore.wire.v1 import twin_pb2
+from rfcore.wire.values import ClockKind
 
 PICTURE = TwinPicture(
     "cav-1", "front", "s-1", 3, 7, 10**18, 5, Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)),

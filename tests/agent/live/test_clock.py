@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cav_agent.live.source import CaptureClock, Stamp
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.values import ClockKind
 
 MS, S = 1_000_000, 1_000_000_000
 BEGAN = 1_700_000_000 * S

@@ -10,7 +10,7 @@ import pytest
 from cav_agent.live.reader import EndRecord, FrameRecord, Header, Record, record_of
 from cav_agent.live.source import LONGEST_PAUSE_S, OPENING_S, Clocks, LiveSource, SourceProblem
 from rfcore.errors import RfedgeError
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.values import ClockKind
 
 S = 1_000_000_000
 BEGAN = 1_700_000_000 * S

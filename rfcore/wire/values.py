@@ -1,0 +1,133 @@
+"""Values that several messages share, to and from protobuf: poses, cameras, references, qualities.
+
+How a frame was sensed (its clock, its localisation) is for those who look at the twin; nothing is
+decoded by it, so a number that this end does not know, from a newer peer, counts as not stated.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from functools import lru_cache
+from typing import Final, cast
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.codec.references import Reference, References
+from rfcore.errors import InvalidInput
+from rfcore.field.quality import Quality
+from rfcore.localise.estimate import LocalisationState
+from rfcore.wire.v1 import edge_pb2 as pb
+
+__all__ = [
+    "ClockKind",
+    "clock_from_wire",
+    "clock_to_wire",
+    "intrinsics_from_wire",
+    "intrinsics_to_wire",
+    "localisation_from_wire",
+    "localisation_to_wire",
+    "pose_from_wire",
+    "pose_to_wire",
+    "quality_from_wire",
+    "quality_to_wire",
+    "references_from_wire",
+    "references_to_wire",
+]
+
+
+def intrinsics_to_wire(k: Intrinsics) -> pb.Intrinsics:
+    """Return intrinsics as protobuf."""
+    return pb.Intrinsics(**vars(k))
+
+
+def intrinsics_from_wire(k: pb.Intrinsics) -> Intrinsics:
+    """Return checked intrinsics; raise ``InvalidInput`` for impossible ones."""
+    return Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px)
+
+
+def pose_to_wire(pose: Pose) -> pb.Pose:
+    """Return a pose as protobuf."""
+    x_m, y_m, z_m = pose.translation_m
+    w, x, y, z = pose.rotation
+    return pb.Pose(
+        x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
+    )
+
+
+def pose_from_wire(pose: pb.Pose) -> Pose:
+    """Return a checked pose; raise ``InvalidInput`` for what is not finite or not a rotation."""
+    rotation = (pose.rotation_w, pose.rotation_x, pose.rotation_y, pose.rotation_z)
+    return Pose((pose.x_m, pose.y_m, pose.z_m), rotation)
+
+
+def references_to_wire(references: References) -> list[pb.Reference.ValueType]:
+    """Return the numbers of references."""
+    return [cast(pb.Reference.ValueType, int(reference)) for reference in references]
+
+
+@lru_cache(maxsize=64)
+def references_from_wire(field: str, numbers: tuple[int, ...]) -> References:
+    """Return the references of these numbers; raise ``InvalidInput`` naming ``field``."""
+    try:
+        return tuple(Reference(number) for number in numbers)
+    except ValueError as error:
+        raise InvalidInput(field, f"{error}; update this end") from error
+
+
+def quality_to_wire(quality: Quality) -> pb.Quality:
+    """Return a quality as protobuf."""
+    return pb.Quality(
+        detail_percent=0 if quality.detail == 1 else round(100 * quality.detail),
+        sh_degree=quality.sh_degree,
+        samples_per_ray=quality.samples_per_ray or 0,
+        scale_percent=0 if quality.scale == 1 else round(100 * quality.scale),
+    )
+
+
+def quality_from_wire(quality: pb.Quality) -> Quality:
+    """Return a checked quality; ``Quality`` itself refuses what is not on the ladder."""
+    return Quality(
+        (quality.detail_percent or 100) / 100,
+        quality.sh_degree if quality.HasField("sh_degree") else None,
+        quality.samples_per_ray or None,
+        (quality.scale_percent or 100) / 100,
+    )
+
+
+class ClockKind(StrEnum):
+    """Sources of a live camera's capture time."""
+
+    SENDER_REPORT = "sender_report"
+    ARRIVAL = "arrival"
+
+
+CLOCKS: Final = {
+    ClockKind.SENDER_REPORT: pb.CAPTURE_CLOCK_SENDER_REPORT,
+    ClockKind.ARRIVAL: pb.CAPTURE_CLOCK_ARRIVAL,
+}
+STATES: Final = {
+    LocalisationState.LOST: pb.LOCALISATION_LOST,
+    LocalisationState.LOCALISING: pb.LOCALISATION_LOCALISING,
+    LocalisationState.TRACKING: pb.LOCALISATION_TRACKING,
+}
+CLOCK_OF: Final[dict[int, ClockKind]] = {number: clock for clock, number in CLOCKS.items()}
+STATE_OF: Final[dict[int, LocalisationState]] = {number: state for state, number in STATES.items()}
+
+
+def clock_to_wire(clock: ClockKind | None) -> pb.CaptureClock.ValueType:
+    """Return the number of ``clock``; 0 for none."""
+    return pb.CAPTURE_CLOCK_UNSPECIFIED if clock is None else CLOCKS[clock]
+
+
+def clock_from_wire(number: int) -> ClockKind | None:
+    """Return the clock that ``number`` stands for, if any."""
+    return CLOCK_OF.get(number)
+
+
+def localisation_to_wire(state: LocalisationState | None) -> pb.Localisation.ValueType:
+    """Return the number of ``state``; 0 for none: the pose was given."""
+    return pb.LOCALISATION_UNSPECIFIED if state is None else STATES[state]
+
+
+def localisation_from_wire(number: int) -> LocalisationState | None:
+    """Return the state that ``number`` stands for, if any."""
+    return STATE_OF.get(number)
