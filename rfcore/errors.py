@@ -15,7 +15,7 @@
     ├── LimitExceeded           a peer asks for more than it may have
     ├── BackendUnavailable      an instruction set or device this machine does not have
     ├── CodecError              encoder or decoder did not do what its configuration promises
-    └── TrainingDiverged        a training run no longer gets anywhere
+    └── TrainingDiverged        a training run no longer converges
 
 A message names the offending value, the limit it broke and what to do about it. Commands print
 it as one line and exit with status 2; services map it to one gRPC status (``rfcore.wire``).
@@ -44,7 +44,7 @@ __all__ = [
 
 
 class RfedgeError(Exception):
-    """Base of all errors rfedge raises on purpose. It comes whole out of another process."""
+    """Base of all errors rfedge raises on purpose; it can be pickled with all its attributes."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), self.args, vars(self))
@@ -106,7 +106,7 @@ class RejectReason(StrEnum):
     OVERLOADED = "overloaded"
     UNKNOWN_STATE = "unknown_state"
     UNSPECIFIED = "unspecified"
-    """Of a newer server, whose reason this vehicle does not know."""
+    """A newer server's reason, which this vehicle does not know."""
 
 
 class PacketRejected(RfedgeError):
@@ -129,7 +129,7 @@ class AccessDenied(RfedgeError):
 class LimitExceeded(RfedgeError):
     """A peer asks for more than it may have; ``limit`` is a word that can be counted.
 
-    ``retry_after_s``: when it may ask again, if that can be said.
+    ``retry_after_s`` says when it may ask again, if that is known.
     """
 
     def __init__(self, limit: str, problem: str, retry_after_s: float | None = None) -> None:
@@ -147,9 +147,9 @@ class CodecError(RfedgeError):
 
 
 class TrainingDiverged(RfedgeError):
-    """A training run left the ground: what it learned last is worth nothing.
+    """A training run diverged: its last parameters are worth nothing.
 
-    ``group`` is the group of parameters that moved furthest, or is not finite.
+    ``group`` is the group of parameters that moved furthest, or that is not finite.
     """
 
     def __init__(self, iteration: int, group: str, problem: str) -> None:

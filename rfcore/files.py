@@ -1,11 +1,11 @@
 """Files and folders that appear whole or not at all.
 
 The content goes to ``NAME.part`` beside the file, which is renamed over it at the end; when writing
-fails the part is removed and what stood there before is untouched. A file is on the disk before it
+fails, the part is removed and what stood there before is untouched. A file is on the disk before it
 gets its name, and the name before the function returns, so that a power cut leaves the old file or
 the new one. A folder is not replaced: it must not exist before.
 
-``open_at_once`` reads what others put into folders, which need not be a file.
+``open_at_once`` opens what others put into folders, which may be no file but a pipe.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 
 
 DECODED_BYTES = 2 << 30
-"""Memory that what a file holds may take, decoded, unless told: 9 million splats of SH degree 3."""
+"""Default limit of the memory for a file's decoded content: 9 million splats of SH degree 3."""
 
 
 def open_at_once(path: Path) -> BufferedReader:
@@ -64,7 +64,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have the names in ``folder`` written to the disk."""
+    """Write the names in ``folder`` to the disk."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -73,7 +73,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _sync_contents(folder: Path) -> None:
-    """Have everything in ``folder`` written to the disk: files, and the names of what it holds."""
+    """Write everything in ``folder`` to the disk: files, and the names of what it holds."""
     for path in folder.rglob("*"):
         if path.is_dir():
             _sync_folder(path)

@@ -1,1 +1,1 @@
-"""Programs that read what others wrote: processes with no right but to compute and to answer."""
+"""Confined processes for reading files of others: they may only compute and answer."""

@@ -1,6 +1,6 @@
-"""How a process gives up its rights, before it reads the first byte that somebody else wrote.
+"""Confine this process, before it reads the first byte that somebody else wrote.
 
-By Landlock (landlock(7)) it takes from itself every right to files and ports, without being root,
+With Landlock (landlock(7)) a process gives up every right to files and ports, without being root,
 also where user namespaces are refused, as under Docker's default profile.
 """
 
@@ -30,7 +30,7 @@ ASK_VERSION = 1
 PR_SET_NO_NEW_PRIVS = 38
 
 FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
-"""How many kinds of file access are known from each version of the interface on."""
+"""Kinds of file access that each version of the interface knows, from the first of these on."""
 PORTS_SINCE, SCOPES_SINCE = 4, 6
 PORT_RIGHTS = 0b11
 """Bind and connect, TCP."""
@@ -93,12 +93,12 @@ NOBODY = 65534
 
 
 class Confinement(StrEnum):
-    """What surrounds a process.
+    """Kinds of confinement.
 
-    ``bubblewrap``: namespaces of its own without network, processes or any file but Python and this
-    code, and the filter of system calls. ``landlock``: no new file and no port, and the same
-    filter; needs no namespaces. ``limits``: resource limits alone, no protection from code that
-    took the process over.
+    * ``bubblewrap``: namespaces of its own without network, processes or any file but Python and
+      this code, and the filter of system calls.
+    * ``landlock``: no new file and no port, and the same filter; needs no namespaces.
+    * ``limits``: resource limits alone, no protection from code that took the process over.
     """
 
     BUBBLEWRAP = "bubblewrap"

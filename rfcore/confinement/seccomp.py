@@ -6,9 +6,9 @@ libseccomp, so that a machine without that library is not one without a filter; 
 numbers and verdicts with libseccomp's.
 
 ``WHILE_STARTING`` is what an interpreter needs to start, to load what it will use, and to fork;
-``WHILE_READING`` is what is left when it reads the first byte of somebody else's: memory that is
-not executable, the descriptors it was given, clocks. No path can be opened then, no process or
-thread started, no socket, no namespace, no signal sent to others.
+``WHILE_READING`` is what is left when it reads the first byte of a foreign file: memory that is
+not executable, the descriptors it was given, clocks. Then it can open no path, start no process or
+thread, make no socket or namespace, and send no signal to others.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ TCGETS, TIOCGWINSZ, FIOCLEX, FIONBIO = 0x5401, 0x5413, 0x5451, 0x5421
 class Allowed:
     """A system call that is allowed, always or where ``argument & mask`` is one of ``values``.
 
-    Of an argument the low 32 bits are looked at: all those used here are ints.
+    Only the low 32 bits of an argument are compared: all those used here are ints.
     """
 
     call: str
@@ -142,7 +142,7 @@ class Allowed:
 
 
 class Refusal(Enum):
-    """What becomes of a call that is not allowed: it fails with EPERM, or ends the process."""
+    """Consequence of a call that is not allowed: it fails with EPERM, or ends the process."""
 
     EPERM = 0x00050000 | 1
     KILL_PROCESS = 0x80000000

@@ -1,4 +1,4 @@
-"""Network addresses: what may be spoken there, and why one cannot be listened on or reached.
+"""Network addresses: whether plaintext is allowed there, and why one cannot be bound or reached.
 
 Plaintext stays on this machine unless it is allowed to leave. gRPC says neither why it cannot bind
 a port nor why it cannot connect: it gives no cause, or keeps trying silently. So the standard
@@ -47,7 +47,7 @@ class Address:
 
     @property
     def is_loopback(self) -> bool:
-        """Whether the address cannot be reached from another machine."""
+        """Whether only this machine can reach the address."""
         if self.host == "localhost":
             return True
         try:
@@ -122,8 +122,8 @@ def _check_tls(address: Address, plain: socket.socket, tls: TlsFiles) -> None:
 def own_problem(tls: TlsFiles) -> str:
     """Return what is wrong with our own certificate by our own clock and authority, or nothing.
 
-    gRPC's server closes the connection without an alert, so we do to ourselves, in memory, what it
-    did to us.
+    gRPC's server closes the connection without an alert, so both ends of the handshake are made
+    here, in memory, to learn what it would have said.
     """
     judge = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     judge.load_cert_chain(tls.certificate, tls.key)
@@ -147,7 +147,7 @@ def own_problem(tls: TlsFiles) -> str:
 
 
 def _check_plaintext(address: Address, plain: socket.socket) -> None:
-    """A server that answers a TLS greeting with TLS does not take plaintext."""
+    """Raise ``AccessDenied`` for a server that answers a TLS greeting with TLS."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.set_alpn_protocols(["h2"])
     context.check_hostname = False

@@ -34,7 +34,7 @@ REASONS_BACK = {number: reason for reason, number in REASONS.items()}
 def server_messages_from_bytes(data: bytes) -> list[ServerMessage]:
     """Parse what a server sent at once: a message, or an answer and the Credit after it.
 
-    A message that only a newer server knows is left out: the list is then empty, and its caller
+    A message that only a newer server knows is ignored: the list is then empty, and the caller
     counts it. Raises ``ProtocolError`` if the bytes are no message, or one with impossible values.
     """
     response = pb.StreamResponse()

@@ -28,7 +28,7 @@ CERTIFICATES = 512
 
 
 class Role(StrEnum):
-    """What a certificate is for."""
+    """Role that a certificate gives its holder."""
 
     SERVER = "server"
     VEHICLE = "vehicle"
@@ -52,8 +52,10 @@ def parse_identity(uri: str) -> tuple[Role, str]:
 
 @dataclass(frozen=True)
 class PeerIdentity:
-    """What a certificate says that the authority vouches for; ``serial`` and ``until`` are None if
-    it could not be read."""
+    """Contents of a certificate that the authority has signed.
+
+    ``serial`` and ``until`` are None if they could not be read.
+    """
 
     uris: tuple[str, ...]
     serial: int | None = None

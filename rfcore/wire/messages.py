@@ -38,7 +38,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class FrameAddress:
-    """Which frame an answer is about."""
+    """The frame that an answer is about."""
 
     camera_id: str
     epoch: int
@@ -55,10 +55,9 @@ class RendererContract:
 
 @dataclass(frozen=True)
 class CameraDescription:
-    """One camera of a vehicle: its geometry, how its pictures are coded, and how many a second it
-    would send (0: not stated).
+    """One camera of a vehicle: its geometry, its coding, and its rate (0: not stated).
 
-    ``camera_from_rig``: its place on a rig, whose pose its frames carry; ``None``: their own.
+    With ``camera_from_rig`` the frames carry the pose of the rig, without it their camera's own.
     """
 
     camera_id: str
@@ -78,8 +77,8 @@ class CameraDescription:
 class Hello:
     """The first message of a stream.
 
-    ``allow_recording``: whether the server may keep the pictures beyond the newest one.
-    ``take_notices``: whether it shall tell what it knows of the street.
+    ``allow_recording`` says whether the server may keep more than the newest pictures,
+    ``take_notices`` whether it should send notices about the street.
     """
 
     vehicle_id: str
@@ -95,13 +94,13 @@ class Frame:
     """One coded picture.
 
     ``pose`` is world_from_cam, tile-relative, or world_from_rig until ``CameraDescription.posed``;
-    it takes half the bytes on the wire when it is ``Pose.rounded``. ``None``: the camera is lost,
-    and the field shows nothing to either end. ``instant``: pictures of a rig with the same number
-    were taken together; 0: it stands alone.
-    An empty ``field_id_prefix`` means the first field of Hello. ``quality`` is
-    what the vehicle rendered the field with, and what the server is to render it with. ``clock``:
-    what a live camera's ``capture_time_ns`` rests on. ``localisation``: of a vehicle that finds its
-    camera in the field; ``None``: the pose was given.
+    it takes half the bytes on the wire when it is ``Pose.rounded``. It is ``None`` while the camera
+    is lost; then the field shows nothing to either end. Pictures of a rig with the same ``instant``
+    were taken together; 0 stands for a camera alone. An empty ``field_id_prefix`` means the first
+    field of Hello. ``quality`` is what the vehicle rendered the field with, and what the server has
+    to render it with. ``clock`` is the source of a live camera's ``capture_time_ns``.
+    ``localisation`` is the state of a vehicle that finds its camera in the field; it is ``None``
+    where the pose was given.
     """
 
     camera_id: str
@@ -135,7 +134,7 @@ class Frame:
 class Welcome:
     """The server accepted Hello; ``exact`` says whether the renderers agree to the bit.
 
-    Each camera may send ``rate_hz`` pictures per second; 0: as many as Credit allows.
+    Each camera may send ``rate_hz`` pictures per second; 0 stands for as many as Credit allows.
     """
 
     session_id: str
@@ -145,7 +144,7 @@ class Welcome:
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Where the server's time went for one frame, nanoseconds."""
+    """Time that each stage of the server took for one frame, nanoseconds."""
 
     queue_ns: int = 0
     render_ns: int = 0
@@ -156,7 +155,7 @@ class StageTimes:
 
 @dataclass(frozen=True)
 class Ack:
-    """The frame was reconstructed; the digest is of the server's picture."""
+    """The frame was reconstructed; the digest is that of the server's picture."""
 
     address: FrameAddress
     times: StageTimes
@@ -188,7 +187,7 @@ class FieldNotice:
 
 @dataclass(frozen=True)
 class DrainNotice:
-    """The server is about to stop, and refuses new streams: open one elsewhere, then close this."""
+    """The server is about to stop and refuses new streams; open one elsewhere, then close this."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""What servers tell each other's consumers over NATS, and which of two servers shows a vehicle.
+"""Subjects and messages of servers that share one twin over NATS, and which of two shows a vehicle.
 
-Without NATS itself, event loop or clock. A server publishes each reconstructed picture as
-TwinService sends it (``WatchResponse`` of twin.proto) on
+This module knows no NATS client, event loop or clock. A server publishes each reconstructed picture
+as TwinService sends it (``WatchResponse`` of twin.proto) on
 
     rfedge.twin.ENCODING.VEHICLE.CAMERA
 
@@ -11,10 +11,10 @@ which session of which server it belongs to: a ``VehicleLocation`` as JSON. The 
 values ``rfedge-places`` holds the same for every vehicle, by name. The object store
 ``rfedge-fields`` holds archives by field id. A name's dots are ``=`` in subjects and keys.
 
-A vehicle that moves has sessions on two servers for a moment. The session that was opened last is
-the vehicle's; the others are ignored, until they end or nothing was heard of them for
-``EXPIRES_S``. Opening times are those of the servers' clocks: servers whose clocks differ by more
-than a vehicle takes to move show it from the older session until that one has ended.
+A vehicle that moves to another server has sessions on both for a moment. The session that was
+opened last is the vehicle's; the others are ignored, until they end or nothing was heard of them
+for ``EXPIRES_S``. Opening times are those of the servers' clocks: servers whose clocks differ by
+more than a vehicle takes to move show it from the older session until that one has ended.
 """
 
 from __future__ import annotations
@@ -69,12 +69,12 @@ SCHEMES: Final = ("nats", "tls")
 
 @dataclass(frozen=True)
 class NatsServers:
-    """How NATS is reached: ``urls``, and files with what proves who we are.
+    """Addresses of NATS servers, and the files that prove who we are.
 
-    ``login``: one line, USER:PASSWORD or a token. ``authority``: who vouches for the servers (PEM),
-    without it the authorities of this machine; ``certificate`` and ``key``: our own. Raises
-    ``InvalidInput`` for plaintext that would leave the machine without permission, for secrets in
-    a URL, and for files that cannot be used.
+    ``login`` holds one line, USER:PASSWORD or a token. ``authority`` is the certificate (PEM) that
+    signs the servers', by default those of this machine; ``certificate`` and ``key`` are our own.
+    Raises ``InvalidInput`` for plaintext that would leave the machine without permission, for
+    secrets in a URL, and for files that cannot be used.
     """
 
     urls: tuple[str, ...]
@@ -103,12 +103,12 @@ class NatsServers:
 
     @property
     def is_secure(self) -> bool:
-        """Whether TLS is spoken, or nothing."""
+        """Whether the connection is encrypted."""
         has_files = self.authority is not None or self.certificate is not None
         return has_files or any(url.startswith("tls:") for url in self.urls)
 
     def tls_context(self) -> ssl.SSLContext:
-        """Return what TLS is spoken with."""
+        """Return the context for encrypted connections."""
         try:
             context = ssl.create_default_context(cafile=self.authority)
             if self.certificate is not None:
@@ -119,7 +119,7 @@ class NatsServers:
         return context
 
     def credentials(self) -> Mapping[str, str]:
-        """Return what the login file says, as options of the client."""
+        """Return the contents of the login file, as options of the client."""
         if self.login is None:
             return {}
         try:
@@ -172,12 +172,12 @@ class VehicleLocation:
 
     @property
     def session(self) -> tuple[str, str]:
-        """Which session it is, of all servers."""
+        """Key of the session among those of all servers."""
         return (self.server, self.session_id)
 
     @property
     def rank(self) -> tuple[int, int, str, str]:
-        """What orders sessions of a vehicle: the highest is where it is."""
+        """Order of a vehicle's sessions: the highest one shows the vehicle."""
         return (self.opened_time_ns, self.epoch, *self.session)
 
     def encode(self) -> bytes:
@@ -191,7 +191,7 @@ class VehicleLocation:
             value: Any = json.loads(data)
             return VehicleLocation(**value)
         except (ValueError, TypeError, InvalidInput) as error:
-            raise ProtocolError(f"a server told an impossible place: {error}") from error
+            raise ProtocolError(f"a server sent an impossible place: {error}") from error
 
 
 class VehicleLocations:
@@ -217,7 +217,7 @@ class VehicleLocations:
         return current is not None and current.session == place.session
 
     def expire(self, now: float) -> None:
-        """Forget what was heard of last more than ``EXPIRES_S`` ago."""
+        """Forget sessions that were last heard of more than ``EXPIRES_S`` ago."""
         for vehicle_id, sessions in tuple(self._heard.items()):
             for session, (_, heard_s) in tuple(sessions.items()):
                 if now - heard_s > EXPIRES_S:
@@ -244,12 +244,12 @@ def key_of(name: str) -> str:
 
 
 def picture_subject(encoding: PictureEncoding, vehicle_id: str, camera_id: str) -> str:
-    """Return where the pictures of a camera are published."""
+    """Return the subject on which the pictures of a camera are published."""
     return f"rfedge.twin.{encoding}.{key_of(vehicle_id)}.{key_of(camera_id)}"
 
 
 def pictures_subject(encoding: PictureEncoding, vehicle_id: str | None = None) -> str:
-    """Return what to subscribe to for a vehicle's pictures, or for those of all."""
+    """Return the subject to subscribe to for a vehicle's pictures, or for those of all."""
     return f"rfedge.twin.{encoding}.{'*' if vehicle_id is None else key_of(vehicle_id)}.*"
 
 
@@ -262,7 +262,7 @@ def vehicle_of_subject(subject: str) -> str:
 
 
 def wanted_subject(encoding: PictureEncoding | None) -> str:
-    """Return where an encoding is asked for; ``None``: what to subscribe to for all."""
+    """Return the subject on which an encoding is asked for; ``None`` stands for all of them."""
     return f"rfedge.wanted.{'*' if encoding is None else encoding}"
 
 

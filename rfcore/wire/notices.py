@@ -1,4 +1,4 @@
-"""What a server tells a vehicle about the street: values, and their form on the wire.
+"""Notices from a server to a vehicle about the street: values, and their form on the wire.
 
 See ``StreetNotice`` in ``edge.proto``. Times are durations, since the clocks of both ends may
 differ: a notice expires ``valid_for_s`` after it arrived.
@@ -33,12 +33,12 @@ Vec3 = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ObjectAhead:
-    """A thing that other cameras see and the field does not have.
+    """An object that other cameras see and the field does not have.
 
-    ``at_m``: its foot, ``velocity_mps``: both in the axes of the tile of field ``field_id``.
-    ``confidence``: 0 to 1. ``age_s``: since it was first seen; ``unseen_s``: since the capture of
-    the picture that showed it last. ``vehicles``: of how many vehicles cameras see it. ``label``:
-    what it is, empty where the server has no detector that says.
+    ``at_m`` is where it stands; like ``velocity_mps`` it is in the axes of the tile of field
+    ``field_id``. ``confidence`` is 0 to 1. ``age_s`` counts from when it was first seen,
+    ``unseen_s`` from the capture of the picture that showed it last. ``vehicles`` is how many
+    vehicles' cameras see it. ``label`` names its class, empty where the server has no detector.
     """
 
     field_id: str
@@ -55,7 +55,7 @@ class ObjectAhead:
 
 
 class FieldChangeKind(StrEnum):
-    """What a newly published field is to its tile."""
+    """Relation of a newly published field to its tile."""
 
     MAP = "map"
     LIGHT = "light"
@@ -66,7 +66,7 @@ NOTICE_KINDS = (OBJECT, *map(str, FieldChangeKind))
 
 @dataclass(frozen=True)
 class FieldChange:
-    """A field that was published for a tile; ``light``: its name, empty for a map."""
+    """A field that was published for a tile; ``light`` is its name, empty for a map."""
 
     kind: FieldChangeKind
     tile: str
@@ -80,7 +80,7 @@ Subject = ObjectAhead | FieldChange
 
 @dataclass(frozen=True)
 class StreetNotice:
-    """``notice_id`` is the same as long as a stream tells of the same subject."""
+    """A notice; ``notice_id`` stays the same as long as a stream tells of the same subject."""
 
     notice_id: int
     valid_for_s: float
@@ -88,7 +88,7 @@ class StreetNotice:
 
     @property
     def kind(self) -> str:
-        """What it tells of: one of ``NOTICE_KINDS``."""
+        """Kind of its subject: one of ``NOTICE_KINDS``."""
         subject = self.subject
         return str(subject.kind) if isinstance(subject, FieldChange) else OBJECT
 

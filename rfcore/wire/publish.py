@@ -1,7 +1,7 @@
-"""Publish a field as the next version of a tile, take it back, say what there is.
+"""Publish a field as the next version of a tile, or take it back.
 
 The archive is checked and put into the folder first; only then does the manifest name it, in one
-rename. Whoever publishes at the same time waits: the folder has a lock, which a crash releases.
+rename. Publishers wait for each other: the folder has a lock, which a crash releases.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ LOCK = ".tiles.lock"
 
 @dataclass(frozen=True)
 class Ground:
-    """Where a tile's field serves; what is None stays as it was, at first: everywhere, 0 m."""
+    """Ground that a tile's field serves.
+
+    What is None stays as it was, at first: everywhere, and 0 m beyond it.
+    """
 
     area: Area | None = None
     margin_m: float | None = None
@@ -52,11 +55,11 @@ def publish(
 ) -> Tile:
     """Make ``archive`` the current version of tile ``name`` of ``folder``; return the tile.
 
-    ``label`` says of which light it is; its base is read from a layer. The field that is current
-    already stays the same version. Raises ``FieldFormatError`` for a damaged archive,
-    ``UnknownField`` for a layer whose base is not in the folder, ``InvalidInput``, also for a light
-    of a tile without a field of its own, or if ``only_after`` is given and is not the tile that is
-    current: somebody else has published meanwhile. The folder then publishes what it did.
+    ``label`` says which light it is of; the base of a layer is read from the archive. A field that
+    is current already stays the same version. Raises ``FieldFormatError`` for a damaged archive,
+    ``UnknownField`` for a layer whose base is not in the folder, and ``InvalidInput`` for a light
+    of a tile without a field of its own, or where ``only_after`` is given and is not the current
+    tile, since somebody else has published meanwhile. The folder is then left as it was.
     """
     store = FieldStore(folder)
     with _locked(folder):

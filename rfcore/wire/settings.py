@@ -42,7 +42,7 @@ PORT_MAX = 65535
 
 @dataclass(frozen=True)
 class MetricsSettings:
-    """Where Prometheus may collect metrics."""
+    """Address at which Prometheus may collect metrics."""
 
     port: Annotated[int | None, arg(name="metrics-port")] = None
     """Port for Prometheus; 0 takes a free one, none are served without it."""
@@ -58,7 +58,7 @@ class MetricsSettings:
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How fields are rendered; the pictures do not depend on it."""
+    """Options of rendering fields; the pictures do not depend on them."""
 
     threads: int = 1
     """Threads per render."""
@@ -72,7 +72,7 @@ class RenderSettings:
 
     @property
     def field_isa(self) -> str | None:
-        """What fields are opened with: ``isa``, or the OpenCL device."""
+        """Instruction set or OpenCL device with which fields are opened."""
         return renderer_isa(self.renderer, self.isa)
 
     def check(self) -> None:
@@ -119,7 +119,7 @@ class TransportSettings:
 
 
 class LogForm(StrEnum):
-    """How log lines look; ``auto`` is console on a terminal and json elsewhere."""
+    """Form of log lines; ``auto`` is console on a terminal and json elsewhere."""
 
     AUTO = "auto"
     CONSOLE = "console"

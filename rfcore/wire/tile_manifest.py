@@ -34,9 +34,9 @@ FORMAT = "rfedge tiles 1"
 
 @dataclass(frozen=True)
 class VersionLabel:
-    """What a version was learnt under; ``light`` empty: the tile's own field, under its own light.
+    """The light that a version was learnt under; empty for the tile's own field.
 
-    The other values as in ``TileLight``.
+    The other values are as in ``TileLight``.
     """
 
     light: str = ""
@@ -50,7 +50,7 @@ OWN_LIGHT = VersionLabel()
 
 @dataclass(frozen=True)
 class TileVersions:
-    """All versions of one tile, the first is number 1; ``times`` (ISO 8601) when each came.
+    """All versions of one tile, from number 1 on; ``times`` (ISO 8601) are when each was published.
 
     ``labels`` has one for each version, or none at all if all are the tile's own. ``current`` is
     the tile's own field, ``lights`` the current version of each other light.
@@ -85,7 +85,7 @@ class TileVersions:
             )
 
     def label(self, number: int) -> VersionLabel:
-        """Return what version ``number`` was learnt under."""
+        """Return the label of version ``number``."""
         return self.labels[number - 1] if self.labels else OWN_LIGHT
 
     def of_light(self, light: str) -> list[int]:
@@ -110,7 +110,7 @@ class TileVersions:
         return replace(self, lights=others if number is None else {**others, light: number})
 
     def tile(self, name: str) -> Tile:
-        """Return what is current."""
+        """Return the current versions."""
         field_id = self.field_ids[self.current - 1]
         lights = tuple(self._light(name, n) for name, n in sorted(self.lights.items()))
         return Tile(name, field_id, self.current, self.area, self.margin_m, lights)
@@ -213,6 +213,6 @@ def _stored(versions: TileVersions) -> dict[str, Any]:
 
 
 def _stored_label(label: VersionLabel) -> dict[str, Any]:
-    """Return what differs from the tile's own light, so that manifests without lights stay."""
+    """Return what differs from the tile's own light, so that plain manifests stay short."""
     plain = asdict(OWN_LIGHT)
     return {name: value for name, value in asdict(label).items() if value != plain[name]}

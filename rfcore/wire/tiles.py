@@ -33,8 +33,8 @@ MAX_TILES = 64
 MAX_LIGHTS = 7
 """Lights of a tile, beside its own field: what both ends keep open."""
 PREVIEW = "preview"
-"""The light that is none: a small field of the tile's own light, with which vehicles begin while
-they fetch the tile's own."""
+"""Reserved name: a small field of the tile's own light, with which vehicles begin while they fetch
+the tile's own field."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Area:
 class TileLight:
     """Another field of a tile, of the street under light ``name``; version ``version`` of the tile.
 
-    ``base_field_id``: the field that it is a colour layer on, empty for a field of its own.
-    ``passes``: how many it was learnt from; ``time_of_day_h``: when, UTC, None where nobody said.
+    ``base_field_id`` is the field that it is a colour layer on, empty for a field of its own.
+    ``passes`` is how many it was learnt from, ``time_of_day_h`` (UTC) when, None if not stated.
     """
 
     name: str
@@ -95,9 +95,9 @@ class TileLight:
 
 @dataclass(frozen=True)
 class Tile:
-    """Version ``version`` of tile ``name`` is field ``field_id``; ``area`` None: everywhere.
+    """A tile whose version ``version`` is field ``field_id``; without ``area`` it is everywhere.
 
-    ``lights``: fields of the same ground under other lights; a vehicle takes what fits.
+    ``lights`` are fields of the same ground under other lights; a vehicle takes what fits best.
     """
 
     name: str
@@ -142,16 +142,16 @@ class Tile:
         return 0.0 if self.area is None else self.area.distance_m(east_m, north_m)
 
     def reaches(self, east_m: float, north_m: float) -> bool:
-        """Whether the field may be used there: in the area or in the margin around it."""
+        """Return whether the field may be used there: in the area or in the margin around it."""
         return self.distance_m(east_m, north_m) <= self.margin_m
 
 
 @dataclass(frozen=True)
 class LearntLight:
-    """What a server learnt last of light ``light`` of a tile, empty for the tile's own.
+    """The field that a server learnt last for a light of a tile (empty for the tile's own).
 
-    ``time_ms``: when, milliseconds of the Unix epoch; ``saved_ratio``: share of the bits that it
-    saved on frames held back; ``withdrawn``: it made somebody's bits more.
+    ``time_ms`` is in milliseconds of the Unix epoch. ``saved_ratio`` is the share of the bits that
+    it saved on frames held back. It was ``withdrawn`` if it cost some vehicle more bits.
     """
 
     tile: str

@@ -146,7 +146,7 @@ def _size_px(k: Intrinsics) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Departure:
-    """A vehicle's camera sends no more pictures."""
+    """Notice that a vehicle's camera sends no more pictures."""
 
     vehicle_id: str
     camera_id: str

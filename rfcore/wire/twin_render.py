@@ -65,9 +65,9 @@ LEAST_FOCAL, MOST_FOCAL = 0.1, 20.0
 """Focal lengths in widths and heights of the picture: 157 degrees to 2.9 degrees."""
 DEFAULT_AGE_S: Final = 2.0
 MAX_AGE_S: Final = 10.0
-"""How old a picture may be that still vouches for pixels."""
+"""Longest age of a picture that still confirms pixels."""
 NO_AGE: Final = 65535
-"""Where no live picture vouches, in ``RenderResponse.age_ms``."""
+"""Value of ``RenderResponse.age_ms`` where no live picture confirms the pixel."""
 MOST_PLACE_M: Final = 1e8
 """Of the world: more than the equator from end to end."""
 
@@ -76,12 +76,11 @@ Vec3 = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """One viewpoint of a published ``tile``, of a field by its id, or of the tile at a ``place`` of
-    the world; exactly one is given.
+    """A viewpoint in a published ``tile``, in a field by its id, or at a ``place`` of the world.
 
-    ``camera`` is relative to the origin of the tile, or to the place. Pictures older than
-    ``max_age_s`` vouch for nothing. ``time_ns``: the moment to show, by the server's clock; 0: now.
-    Raises ``InvalidInput`` for a camera no one could look through.
+    Exactly one of the three is given. ``camera`` is relative to the origin of the tile, or to the
+    place. Pictures older than ``max_age_s`` are not used. ``time_ns`` is the moment to show, by the
+    server's clock; 0 stands for now. Raises ``InvalidInput`` for a camera beyond the limits.
     """
 
     camera: Camera
@@ -103,8 +102,11 @@ class ViewRequest:
 
 @dataclass(frozen=True)
 class LiveCamera:
-    """A camera that was looked at for a view. ``share``: of the view's pixels, that it vouches
-    for; ``outvoted``: it disagrees with the field nearly everywhere."""
+    """A live camera that took part in a view.
+
+    ``share`` is that of the view's pixels that it confirms; an ``outvoted`` camera disagrees with
+    the field nearly everywhere.
+    """
 
     vehicle_id: str
     camera_id: str
@@ -117,9 +119,9 @@ class LiveCamera:
 class RenderedView:
     """A view as it was composed.
 
-    ``rgb`` uint8 [H, W, 3], None where the picture was not asked for; ``depth`` of the field,
-    float32 [H, W], metres, 0: nothing hit; ``age_ms`` uint16 [H, W], ``NO_AGE`` where no live
-    picture vouches. ``picture`` is ``rgb`` in ``encoding``.
+    ``rgb`` is uint8 [H, W, 3], None where the picture was not asked for; ``picture`` is the same in
+    ``encoding``. ``depth`` of the field is float32 [H, W] in metres, 0 where nothing is hit.
+    ``age_ms`` is uint16 [H, W], ``NO_AGE`` where no live picture confirms the pixel.
     """
 
     number: int
@@ -142,14 +144,17 @@ class RenderedView:
 
     @property
     def live(self) -> NDArray[np.bool_]:
-        """Where a live picture vouches, [H, W]."""
+        """Pixels that a live picture confirms, [H, W]."""
         return np.asarray(self.age_ms != NO_AGE)
 
 
 @dataclass(frozen=True)
 class ObjectsRequest:
-    """Where to look for objects: a published ``tile``, a field by its id, or the tile at a
-    ``place`` of the world, to which objects are relative then; exactly one."""
+    """A request for the objects of a published ``tile``, of a field, or at a ``place`` of the
+    world.
+
+    Exactly one of the three is given; objects are relative to the place if it is.
+    """
 
     tile: str = ""
     field_id: str = ""

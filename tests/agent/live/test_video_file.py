@@ -19,7 +19,7 @@ from cav_agent.live_cameras import LiveCameras, open_live_cameras
 from cav_agent.pose_feed.sources import PoseFeedSettings
 from rfcore.camera import TileOrigin
 from rfcore.errors import DatasetError, RfedgeError
-from rfcore.wire.sensing import ClockKind
+from rfcore.wire.values import ClockKind
 
 SIZE_PX = (64, 48)
 CAMERA = "[camera]\nwidth_px = 64\nheight_px = 48\nfx_px = 40.0\n"
