@@ -12,7 +12,8 @@ shorter than 1e-12 counts as no rotation.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from threading import Lock
@@ -83,15 +84,15 @@ def bands_to_use(sh_degree: int | None, stored: int) -> int:
     return degree
 
 
-class overlaps_limited:  # noqa: N801 - reads as a condition in a with statement
+@contextmanager
+def overlaps_limited() -> Iterator[None]:
     """Turn the kernels' refusal of too many overlaps into ``InvalidInput``."""
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, ValueError) and not isinstance(error, InvalidInput):
-            raise InvalidInput("gaussians", str(error)) from error
+    try:
+        yield
+    except InvalidInput:
+        raise
+    except ValueError as error:
+        raise InvalidInput("gaussians", str(error)) from error
 
 
 def check_renderer(threads: int, isa: str | None) -> str:

@@ -28,6 +28,7 @@ from rfcore.field import SplatField
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.trainable import TrainableRasterizer
+from rfcore.train.targets import PictureAdam
 from rfcore.views import PosedPicture
 
 __all__ = [
@@ -42,19 +43,18 @@ __all__ = [
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
-"""Of Adam; the second moment of a picture is that of its last hundred visits."""
+EPSILON = 1e-15
 STEP_PX = 0.1
-"""Most that a step moves the picture at first, in pixels."""
+"""Most that a step at the start moves the picture, in pixels."""
 ALIGN_STEPS = 40
-"""Of aligning a picture with a field that is held."""
+"""Steps of aligning a picture with a field that is kept as it is."""
 FALL = 0.05
 """The rate at the end, as a share of that at the start."""
 
 
 @dataclass(frozen=True)
 class PoseCorrection:
-    """How a picture's pose was changed: metres and degrees."""
+    """The change of a picture's pose in metres and degrees."""
 
     name: str
     moved_m: float
@@ -62,7 +62,8 @@ class PoseCorrection:
 
 
 def pose_gradient(gaussians: Gaussians, gradients: Mapping[str, F32], centre_m: Vec3) -> F64:
-    """Return dL by translation (3) and rotation vector (3) of a camera at ``centre_m``, world axes.
+    """Return the gradient of the loss by translation (3) and rotation vector (3) of a camera at
+    ``centre_m``, in world axes.
 
     ``gradients`` are those of ``TrainableRasterizer.gradients`` after its ``backward``.
     """
@@ -79,7 +80,7 @@ def pose_gradient(gaussians: Gaussians, gradients: Mapping[str, F32], centre_m: 
 def typical_depth_m(gaussians: Gaussians, cameras: Sequence[Camera]) -> float:
     """Return the median distance of the Gaussians in front of the cameras, at least 1 mm.
 
-    A hundred Gaussians and every camera are enough to know it.
+    It looks at a hundred Gaussians from every camera, which is enough.
     """
     step = max(1, len(gaussians) // 100)
     points = gaussians.means[::step].astype(np.float64)
@@ -95,7 +96,7 @@ def _depths(camera: Camera, points: F64) -> list[float]:
 
 
 def corrected(camera: Camera, correction: F64) -> Camera:
-    """Return a camera moved and turned, world axes, by a translation and a rotation vector [6]."""
+    """Return a camera moved and turned in world axes by a translation and a rotation vector [6]."""
     x, y, z, a, b, c = correction.tolist()
     pose = camera.world_from_cam
     turn = Pose((0.0, 0.0, 0.0), quaternion_from_vector((a, b, c)))
@@ -107,36 +108,27 @@ def corrected(camera: Camera, correction: F64) -> Camera:
 class PoseModel:
     """The corrections of a run's cameras [V, 6], learned by Adam when a picture is visited.
 
-    ``depth_m``: how far away the scene is, which makes a step of the position that of a turn.
+    ``depth_m``: the scene's distance; it scales steps of position to the effect of a rotation.
     """
 
     def __init__(self, cameras: Sequence[Camera], depth_m: float) -> None:
         self._cameras = list(cameras)
         self._depth_m = depth_m
-        shape = (len(self._cameras), 6)
-        self._steps, self._first, self._second = (np.zeros(shape) for _ in range(3))
-        self._visits = np.zeros(len(self._cameras))
+        self.adam = PictureAdam("poses", np.zeros((len(self._cameras), 6)), EPSILON)
 
     def camera(self, view: int) -> Camera:
-        """Return a picture's camera where it is now."""
-        return corrected(self._cameras[view], self._steps[view] - self._steps.mean(axis=0))
+        """Return the corrected camera of a picture."""
+        steps = self.adam.values
+        return corrected(self._cameras[view], steps[view] - steps.mean(axis=0))
 
     def step(self, view: int, gradient: F64, progress: float) -> None:
         """Do one step of Adam; ``progress`` 0..1 lowers its rate."""
-        self._visits[view] += 1
-        first, second = self._first[view], self._second[view]
         scale = np.array([self._depth_m] * 3 + [1.0] * 3)
         scaled = gradient * scale  # of a displacement in units of the depth, as of a turn
-        first += (1 - BETA1) * (scaled - first)
-        second += (1 - BETA2) * (scaled * scaled - second)
-        visits = int(self._visits[view])
-        mean = first / (1 - np.multiply.reduce(np.full(visits, BETA1)))
-        square = second / (1 - np.multiply.reduce(np.full(visits, BETA2)))
-        rate = self._rate_rad(view, progress)
-        self._steps[view] -= rate * scale * mean / (np.sqrt(square) + EPSILON)
+        self.adam.step(view, scaled, self._rate_rad(view, progress) * scale)
 
     def corrections(self, names: Sequence[str]) -> list[PoseCorrection]:
-        """Return what became of the pictures' poses."""
+        """Return how the pictures' poses were changed."""
         found = []
         for view, name in enumerate(names):
             before, after = self._cameras[view].world_from_cam, self.camera(view).world_from_cam
@@ -144,19 +136,6 @@ class PoseModel:
             turned_deg = math.degrees(math.hypot(*rotation_vector(between.rotation)))
             found.append(PoseCorrection(name, math.hypot(*between.translation_m), turned_deg))
         return found
-
-    def arrays(self) -> dict[str, F64]:
-        """Return what ``restore`` goes on from."""
-        parts = {"steps": self._steps, "first": self._first, "second": self._second}
-        copies = {f"poses.{name}": array.copy() for name, array in parts.items()}
-        return copies | {"poses.visits": self._visits.copy()}
-
-    def restore(self, arrays: Mapping[str, F64]) -> None:
-        """Go on from ``arrays``."""
-        self._steps = arrays["poses.steps"].copy()
-        self._first = arrays["poses.first"].copy()
-        self._second = arrays["poses.second"].copy()
-        self._visits = arrays["poses.visits"].copy()
 
     def _rate_rad(self, view: int, progress: float) -> float:
         share = FALL + (1 - FALL) * 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
@@ -166,10 +145,10 @@ class PoseModel:
 def align_pictures(
     field: SplatField, pictures: Sequence[PosedPicture], depth_m: float, threads: int
 ) -> list[PosedPicture]:
-    """Return pictures with poses aligned with a field that is held, each on its own.
+    """Return pictures with poses aligned with a field that is kept as it is, each by itself.
 
-    What a vehicle does that finds its pose in the field; for fields that are measured with poses
-    that are themselves wrong.
+    A vehicle that finds its pose in the field does the same. It is for measuring a field with
+    pictures whose poses are wrong.
     """
     antialiased = field.metadata.antialiased
     rasterizer = TrainableRasterizer(field.gaussians, threads=threads, antialiased=antialiased)
@@ -193,5 +172,5 @@ class _Alone(PoseModel):
     """The camera of one picture, which may go anywhere."""
 
     def camera(self, view: int) -> Camera:
-        """Return the camera where it is now."""
-        return corrected(self._cameras[view], self._steps[view])
+        """Return the corrected camera."""
+        return corrected(self._cameras[view], self.adam.values[view])

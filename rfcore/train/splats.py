@@ -174,10 +174,8 @@ class SplatTrainer(FieldTrainer):
             values = getattr(state, part)
             arrays |= {f"{part}.{f.name}": getattr(values, f.name) for f in fields(values)}
         values = {"beta_powers": list(state.beta_powers), "watch": self._watch.values()}
-        if self._exposure is not None:
-            arrays |= self._exposure.arrays()
-        if self._poses is not None:
-            arrays |= self._poses.arrays()
+        for model in self._models_of_pictures():
+            arrays |= model.adam.arrays()
         return Checkpoint(self.kind, self.training_digest, self.iteration, values, arrays)
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -194,15 +192,16 @@ class SplatTrainer(FieldTrainer):
         )
         self._rasterizer = self._rasterizer_of(state.gaussians)
         self._rasterizer.set_optimiser(state)
-        if self._exposure is not None:
-            self._exposure.restore(arrays)
-        if self._poses is not None:
-            self._poses.restore(arrays)
+        for model in self._models_of_pictures():
+            model.adam.restore(arrays)
         self._watch.restore(checkpoint.values["watch"])
         self._order = view_order(len(self._targets), self._order_rng())
         for _ in islice(self._order, checkpoint.iteration):
             pass
         self.iteration = checkpoint.iteration
+
+    def _models_of_pictures(self) -> list[ExposureModel | PoseModel]:
+        return [model for model in (self._exposure, self._poses) if model is not None]
 
     def _order_rng(self) -> np.random.Generator:
         return np.random.default_rng([self._seed, 1])

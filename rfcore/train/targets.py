@@ -1,8 +1,8 @@
-"""The pictures a field is trained on: their pixels, random rays through them, their exposure.
+"""The pictures a field is trained on: their pixels, random rays, and numbers learnt for each.
 
 Pictures are held in memory as 8-bit pixels. The n-th batch of rays of a seed is always the same, so
-a run that goes on from a checkpoint needs no state of it; rays are computed in float64 with
-elementwise operations only (no BLAS), then rounded once.
+a checkpoint need not store it; rays are computed in float64 with elementwise operations only (no
+BLAS), then rounded once.
 """
 
 from __future__ import annotations
@@ -21,12 +21,21 @@ from rfcore.ngp.trainable import RayBatch
 from rfcore.raster.trainable import Exposure
 from rfcore.views import PosedPicture
 
-__all__ = ["ExposureModel", "RaySampler", "Target", "halved", "load_targets"]
+__all__ = [
+    "ExposureModel",
+    "PictureAdam",
+    "RaySampler",
+    "Target",
+    "halved",
+    "load_targets",
+]
 
 F64 = NDArray[np.float64]
 EXPOSURE_RATE = 3e-3
-"""Adam's, at the start of the run: a stop of exposure within some hundred visits."""
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12
+"""Adam's rate at the start of the run: it learns a stop of exposure within some hundred visits."""
+EXPOSURE_EPSILON = 1e-12
+BETA1, BETA2 = 0.9, 0.99
+"""Adam's constants for a picture: its second moment is that of its last hundred visits."""
 NO_CHANGE = np.eye(3, 4)
 
 
@@ -71,7 +80,7 @@ def halved(target: Target) -> Target:
 
 
 class RaySampler:
-    """Draws pixels of ``targets``, every one as likely as any other."""
+    """Draws pixels of ``targets`` uniformly."""
 
     def __init__(self, targets: Sequence[Target], seed: int) -> None:
         self._seed = seed
@@ -111,26 +120,20 @@ class RaySampler:
         return np.ascontiguousarray(turned / length[:, None], dtype=np.float32)
 
 
-class ExposureModel:
-    """Per-picture exposure: one affine map of colours [3, 4] a picture, learned with the field.
+class PictureAdam:
+    """Adam on one set of numbers a picture, which moves when the picture is visited.
 
-    Only for datasets that declare it. A picture's map moves when the picture is visited. The maps'
-    mean over the pictures is kept at "no change", so the field itself shows the mean picture and is
-    rendered without any map.
+    ``values`` [V, ...]: the numbers of V pictures. ``name`` prefixes the arrays of a checkpoint.
     """
 
-    def __init__(self, views: int) -> None:
-        self._maps = np.tile(NO_CHANGE, (views, 1, 1))
-        self._first, self._second = np.zeros_like(self._maps), np.zeros_like(self._maps)
-        self._visits = np.zeros(views)
+    def __init__(self, name: str, values: F64, epsilon: float) -> None:
+        self.values = values
+        self._name, self._epsilon = name, epsilon
+        self._first, self._second = np.zeros_like(values), np.zeros_like(values)
+        self._visits = np.zeros(len(values))
 
-    def of_view(self, view: int) -> Exposure:
-        """Return the map of a picture, with room for its gradient."""
-        affine = self._maps[view] - self._maps.mean(axis=0) + NO_CHANGE
-        return Exposure(np.ascontiguousarray(affine, np.float32), np.zeros((3, 4)))
-
-    def step(self, view: int, gradient: F64, factor: float) -> None:
-        """Do one step of Adam at ``factor`` times the rate."""
+    def step(self, view: int, gradient: F64, rate: float | F64) -> None:
+        """Visit a picture: move its numbers by ``rate``, down this gradient."""
         self._visits[view] += 1
         first, second = self._first[view], self._second[view]
         first += (1 - BETA1) * (gradient - first)
@@ -138,17 +141,41 @@ class ExposureModel:
         # Multiplied out: two C libraries' pow() need not agree.
         powers = np.multiply.reduce(np.tile([BETA1, BETA2], (int(self._visits[view]), 1)))
         mean, square = first / (1 - powers[0]), second / (1 - powers[1])
-        self._maps[view] -= EXPOSURE_RATE * factor * mean / (np.sqrt(square) + EPSILON)
+        self.values[view] -= rate * mean / (np.sqrt(square) + self._epsilon)
 
     def arrays(self) -> dict[str, F64]:
-        """Return what ``restore`` goes on from."""
-        parts = {"maps": self._maps, "first": self._first, "second": self._second}
-        copies = {f"exposure.{name}": array.copy() for name, array in parts.items()}
-        return copies | {"exposure.visits": self._visits.copy()}
+        """Return copies of everything that ``restore`` goes on from."""
+        parts = {
+            "values": self.values,
+            "first": self._first,
+            "second": self._second,
+            "visits": self._visits,
+        }
+        return {f"{self._name}.{part}": array.copy() for part, array in parts.items()}
 
     def restore(self, arrays: Mapping[str, F64]) -> None:
         """Go on from ``arrays``."""
-        self._maps = arrays["exposure.maps"].copy()
-        self._first = arrays["exposure.first"].copy()
-        self._second = arrays["exposure.second"].copy()
-        self._visits = arrays["exposure.visits"].copy()
+        parts = ("values", "first", "second", "visits")
+        copies = (arrays[f"{self._name}.{part}"].copy() for part in parts)
+        self.values, self._first, self._second, self._visits = copies
+
+
+class ExposureModel:
+    """Exposure of each picture: an affine map of colours [3, 4], learned with the field.
+
+    The maps' mean over the pictures is kept at "no change", so the field itself shows the mean
+    picture and is rendered without any map.
+    """
+
+    def __init__(self, views: int) -> None:
+        self.adam = PictureAdam("exposure", np.tile(NO_CHANGE, (views, 1, 1)), EXPOSURE_EPSILON)
+
+    def of_view(self, view: int) -> Exposure:
+        """Return the map of a picture, with room for its gradient."""
+        maps = self.adam.values
+        affine = maps[view] - maps.mean(axis=0) + NO_CHANGE
+        return Exposure(np.ascontiguousarray(affine, np.float32), np.zeros((3, 4)))
+
+    def step(self, view: int, gradient: F64, factor: float) -> None:
+        """Do one step of Adam at ``factor`` times the rate."""
+        self.adam.step(view, gradient, EXPOSURE_RATE * factor)

@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfcore.image import Rgb
+from rfcore.train.targets import Target
 from rfcore.views import PosedPicture
 
 __all__ = [
@@ -28,7 +26,7 @@ __all__ = [
 
 HOLD_BACK_EVERY = 4
 FEWEST_FRAMES = 8
-"""Of a pass: two are held back, one after the other."""
+"""Fewest frames of a pass: two of eight are held back, and not next to each other."""
 
 
 @dataclass(frozen=True)
@@ -40,20 +38,14 @@ class Pass:
 
 
 @dataclass(frozen=True)
-class SeenFrame:
-    """What ``camera`` saw: ``rgb`` uint8 [H, W, 3], in the pass of that number."""
+class SeenFrame(Target):
+    """A camera and its picture, with the number of the pass it belongs to."""
 
-    camera: Camera
-    rgb: Rgb
     pass_number: int
-
-    def colour(self) -> NDArray[np.float32]:
-        """Return the picture as float32 [H, W, 3] in 0..1."""
-        return self.rgb.astype(np.float32) / np.float32(255.0)
 
 
 def check_passes(passes: Sequence[Pass], min_identities: int) -> None:
-    """Raise ``InvalidInput`` for passes that nothing is learnt from."""
+    """Raise ``InvalidInput`` for too few vehicles, or a pass of too few frames."""
     identities = {drive.identity for drive in passes}
     if len(identities) < min_identities:
         raise InvalidInput(

@@ -109,7 +109,7 @@ def test_a_run_goes_on_from_its_arrays():
     gradients = np.random.default_rng(2).normal(size=(6, 6))
     for n, gradient in enumerate(gradients[:3]):
         one.step(n % 2, gradient, 0.1)
-    other.restore(one.arrays())
+    other.adam.restore(one.adam.arrays())
     for n, gradient in enumerate(gradients[3:]):
         one.step(n % 2, gradient, 0.5)
         other.step(n % 2, gradient, 0.5)
@@ -150,7 +150,7 @@ def test_training_with_wrong_poses_ends_nearer_to_the_right_ones(scene, halved_u
     )
     assert np.mean(after) < 0.5 * np.mean(before)
     assert len(trainer.pose_corrections()) == 8
-    assert trainer.checkpoint().arrays["poses.steps"].shape == (8, 6)
+    assert trainer.checkpoint().arrays["poses.values"].shape == (8, 6)
 
 
 def test_poses_and_exposure_are_not_learned_together():
