@@ -6,10 +6,11 @@ ports. A process that ends early is reported with the last lines of its log.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,17 +41,24 @@ def command_of(name: str) -> list[str]:
 
 
 @contextmanager
-def service(name: str, command: Sequence[str], work_dir: Path) -> Iterator[Service]:
+def service(
+    name: str, command: Sequence[str], work_dir: Path, variables: Mapping[str, str] | None = None
+) -> Iterator[Service]:
     """Run a service until the block ends, then stop it with SIGTERM.
 
-    ``--ready-file`` is appended to ``command``. Raises ``RfedgeError`` when the process ends or
-    stays silent before it is ready, and when it does not stop within 10 s.
+    ``--ready-file`` is appended to ``command``; ``variables`` are added to its environment. Raises
+    ``RfedgeError`` when the process ends or stays silent before it is ready, and when it does not
+    stop within 10 s.
     """
     ready_path, log_path = work_dir / f"{name}.ready.json", work_dir / f"{name}.log"
     ready_path.unlink(missing_ok=True)
     with log_path.open("wb") as log:
         process = subprocess.Popen(
-            [*command, "--ready-file", str(ready_path)], stdout=log, stderr=subprocess.STDOUT
+            [*command, "--ready-file", str(ready_path)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **(variables or {})},
         )
         try:
             _await_ready(name, process, ready_path, log_path)

@@ -249,7 +249,7 @@ DRIVE = f"empty@10={ROOT / 'samples/street/transforms_drive_empty.json'}"
         ("cv2", "localise", f"localise {DRIVE.partition('=')[2]} --field {FIELD}"),
         ("nats", "nats", "watch --nats nats://127.0.0.1:4222"),
         ("psutil", "loadtest", "loadtest"),
-        ("scipy", "loadtest", "loadtest"),
+        ("h2", "loadtest", "loadtest"),
         ("cryptography", "ops", "certs init --vehicles car-1"),
         ("cryptography", "ops", "certs show"),
         ("pycolmap", "colmap", f"dataset poses {ROOT}/samples/street/train --out made"),

@@ -19,6 +19,7 @@ from lab.live.report import live_section
 from lab.localisation.rows import localise_section
 from lab.pages.demo import demo_section
 from lab.pages.loads import load_section, ratio_section
+from lab.pages.training import training_section
 from lab.paper.figures import write_paper_figures
 from lab.paper.report import paper_rows, paper_section
 from lab.rig.report import rig_section
@@ -33,7 +34,6 @@ from rfedge.evaluate.ladder.page import write_ladder_figure
 from rfedge.evaluate.never_worse.measure import never_worse_section
 from rfedge.report.tables import heading, plain_section
 from rfedge.results import Result, read_result
-from rfedge.training.report import training_section
 
 __all__ = ["results_page", "with_headline", "write_figures"]
 

@@ -23,7 +23,7 @@ RFV = arg(metavar="FILE.rfv")
 
 @dataclass(frozen=True)
 class Encode:
-    """Code a drive against a field's renders; write the vehicle's messages as a .rfv file."""
+    """Encode a drive against a field's renders; write the vehicle's messages to a .rfv file."""
 
     drive: Annotated[Path, Positional, DATASET]
     """Posed pictures in time order, a dataset of any format (docs/how-to/data.md)."""
@@ -33,21 +33,21 @@ class Encode:
     """The coded drive to write."""
     coding: OmitArgPrefixes[CoderSettings] = CoderSettings()
     crf: float = 23.0
-    """Quality, x264's constant rate factor, 1 (best) to 51."""
+    """Quality as x264's constant rate factor, 1 (best) to 51."""
     mask: Annotated[Path | None, arg(metavar="PICTURE")] = None
-    """Picture of the camera's size, white where frames are to be coded finer."""
+    """Picture of the camera's size that is white where --mask-qp applies."""
     mask_qp: int = -6
-    """Added to H.264's quantiser in the mask, -24..24; -6 halves its step."""
+    """Change of H.264's QP inside the mask, -24..24; -6 halves the quantiser's step."""
     localise: bool = False
-    """Find the poses in the field, near the dataset's own; frames whose pose is not found are coded
-    without the field."""
+    """Find the poses in the field, near the dataset's own; a frame without a pose is coded without
+    the field."""
     threads: int = 2
     """Threads of the rasterizer."""
     renderer: Annotated[str, RENDERER] = "cpu"
-    """Splats are drawn by the CPU or an OpenCL device, with the same bytes."""
+    """Render splats on the CPU or on an OpenCL device; the bytes are the same."""
 
     def run(self) -> None:
-        """Code the drive and print its size."""
+        """Encode the drive and print its size."""
         from rfcore.codec.h264.qp_map import MaskSettings
         from rfcore.dataset import read_dataset
         from rfcore.raster.renderers import renderer_isa
@@ -70,7 +70,7 @@ class Encode:
         )
 
     def _located(self, field: RadianceField, dataset: Dataset) -> Locate | None:
-        """Return what finds the poses, if that is asked for."""
+        """Return the function that finds the poses, or None without --localise."""
         if not self.localise:
             return None
         from rfedge.located import LocatedDrive, own_poses
@@ -80,7 +80,7 @@ class Encode:
 
 @dataclass(frozen=True)
 class Decode:
-    """Reconstruct a coded drive as PNG files, with the field it was coded against."""
+    """Decode a .rfv file to PNG files, with the field that it was encoded against."""
 
     coded: Annotated[Path, Positional, RFV]
     """The coded drive."""
@@ -89,11 +89,11 @@ class Decode:
     out: Annotated[Path, FOLDER]
     """Folder for the PNG files."""
     decoder: Literal["auto", "bubblewrap", "landlock", "child", "in-process"] = "auto"
-    """Where H.264 is decoded, as for mec-server; auto: the best sandbox that works here."""
+    """Sandbox of the H.264 decoder, as for mec-server; auto: the best one that works here."""
     threads: int = 2
     """Threads of the rasterizer."""
     renderer: Annotated[str, RENDERER] = "cpu"
-    """Splats are drawn by the CPU or an OpenCL device, with the same bytes."""
+    """Render splats on the CPU or on an OpenCL device; the bytes are the same."""
 
     def run(self) -> None:
         """Decode every frame; stop at the first packet that fails a check."""

@@ -19,47 +19,47 @@ __all__ = ["Eval", "LoadTest"]
 
 @dataclass(frozen=True)
 class LoadTest:
-    """Put a number of vehicles, each on its own link, on a server, and say whether it holds."""
+    """Put vehicles, each on its own link, on a server, and say whether it holds the load."""
 
     vehicles: int = 4
-    """How many; with --find-limit, how many to begin with."""
+    """Number of vehicles; with --find-limit the number to begin with."""
     mode: Literal["transport", "receiver", "full"] = "full"
-    """What the server does: nothing with the pictures, decode against kept renders, everything."""
+    """Work of the server: transport does not decode, receiver decodes against cached renders, full
+    renders and decodes."""
     hz: float = 10.0
     """Pictures per second of each camera."""
     cameras: int = 1
     """Cameras of each vehicle."""
     size: int = 4096
-    """Bytes of payload of a frame in transport mode; otherwise the drive's own."""
+    """Payload of a frame in transport mode, bytes; other modes send the drive's frames."""
     link: Annotated[Path | None, arg(metavar="FILE.toml")] = None
-    """Link profile (TOML, see samples/links), a link for each vehicle; default: loopback."""
+    """Link profile (TOML, see samples/links); each vehicle has its own link. Default: loopback."""
     duration: float = 20.0
-    """Seconds that are counted."""
+    """Measured time, s."""
     warm_up: float = 10.0
-    """Seconds before them that are not."""
+    """Time before it that is not measured, s."""
     deadline_ms: float = 100.0
-    """From the moment a picture is due to its Ack."""
+    """Time that a picture may take from the moment it is due to its Ack, ms."""
     vehicle_ms: float = 0.0
-    """How long a prerecorded vehicle waits before sending, in place of a real one's encoding."""
+    """Time that a prerecorded vehicle waits before sending, in place of encoding, ms."""
     live: bool = False
-    """Vehicles that render and encode (cav-agent processes), instead of prerecorded packets."""
+    """Start vehicles that render and encode (cav-agent) instead of replaying packets."""
     admission: bool = False
-    """Let the server refuse vehicles or lower their rate; the verdict is about those let in."""
+    """Let the server refuse vehicles or lower their rate; those that are refused do not count."""
     find_limit: bool = False
-    """Look for the largest number that holds."""
+    """Look for the largest number of vehicles that the server holds."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
-    """Field archive, the only one in its folder."""
+    """The field, an archive that is alone in its folder."""
     drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
     """Drive whose pictures the vehicles send."""
     runs: int = 1
-    """Run the load so many times, a row each; it is held if every run is."""
+    """Number of runs of the load; it is held if every run is."""
     workers: int = 2
-    """Frames the server reconstructs at once."""
+    """Number of frames that the server reconstructs at once."""
     threads: int = 1
-    """Of a render, at the server of --mode full and in vehicles that are --live, which encode with
-    as many."""
+    """Threads of each renderer, at the server with --mode full and in vehicles with --live."""
     renderer: Annotated[str, RENDERER] = "cpu"
-    """What the server of --mode full draws with, and vehicles that are --live."""
+    """Renderer of the server with --mode full and of vehicles with --live."""
     out: Annotated[Path, FOLDER] = Path("out/loadtest")
     """Folder for report.html and result.json."""
     cache: Annotated[Path, FOLDER] = Path("out/cache/loadtest")

@@ -1,4 +1,4 @@
-"""``rfedge render``: look at a field, around it or along a drive."""
+"""``rfedge render``: render a field on an orbit around it or along a drive."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ class Render:
     out: Annotated[Path, arg(metavar="FOLDER|FILE.mp4")]
     """Folder for the PNG files, or a file ending in .mp4."""
     path: Literal["orbit", "drive"] | None = None
-    """Once around the field, or the poses of a drive (default: drive if there is one)."""
+    """Orbit around the field, or the poses of a drive; default: drive if --drive is given."""
     drive: Annotated[Path | None, DATASET] = None
     """A dataset with the poses; its pictures are used only to print PSNR."""
     psnr: bool = False
     """Print the PSNR of each render against the drive's picture, dB."""
     frames: int = 96
-    """Pictures of an orbit."""
+    """Number of pictures of an orbit."""
     size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (960, 540)
     """Width and height of an orbit's pictures, px."""
     up: Literal["z", "y", "-y"] = "z"
-    """Where up is in the field's frame (orbit)."""
+    """Axis of the field that points up (orbit)."""
     rate_hz: float = 24.0
     """Pictures per second of the MP4."""
     detail: float = 1.0
-    """Share of the splats drawn: 1, 0.5, 0.25 or 0.1."""
+    """Share of the splats to render: 1, 0.5, 0.25 or 0.1."""
     sh_degree: int | None = None
-    """Highest degree of spherical harmonics drawn; default: all."""
+    """Highest degree of spherical harmonics to render; default: all."""
     threads: int = 2
     """Threads of the renderer."""
     isa: str | None = None
     """Force an instruction set: avx512, avx2, neon or scalar."""
     renderer: Annotated[str, RENDERER] = "cpu"
-    """Splats are drawn by the CPU or an OpenCL device, with the same bytes."""
+    """Render splats on the CPU or on an OpenCL device; the bytes are the same."""
 
     def run(self) -> None:
         """Render the path."""

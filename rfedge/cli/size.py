@@ -20,31 +20,31 @@ __all__ = ["Size"]
 
 @dataclass(frozen=True)
 class Size:
-    """Say what cameras need of an uplink and of both ends: ours, x264, x265 and SVT-AV1.
+    """Estimate the uplink and the cores that cameras need with us, x264, x265 and SVT-AV1.
 
-    From tables measured on the sample street (docs/sizing.md), or on a drive and field of your own.
+    The estimate comes from tables measured on the sample street, or from your own drive and field.
     """
 
     cameras: int = 1
-    """Cameras of a vehicle, which take their pictures at the same instant."""
+    """Cameras of a vehicle; they take their pictures at the same instant."""
     size: Annotated[str, SIZE] = "1920x1080"
-    """Pixels of a picture."""
+    """Size of a picture, px."""
     hz: float = 10.0
-    """Pictures a second of each camera."""
+    """Pictures per second of each camera."""
     db: float = 34.0
-    """Luma PSNR of the reconstruction."""
+    """Luma PSNR of the reconstruction, dB."""
     delay_ms: float | None = None
-    """Also the link that brings frames to their reconstruction within so many milliseconds."""
+    """Also estimate the link that keeps this time from a picture to its reconstruction, ms."""
     share: float = 0.99
-    """Share of the frames that have to be in time."""
+    """Share of the frames that must keep --delay-ms."""
     drive: Annotated[Path | None, DATASET] = None
-    """Measure on this drive instead of the tables (extra eval); with --field."""
+    """Measure on this drive instead of using the tables; needs --field and the extra eval."""
     field: Annotated[Path | None, FIELD] = None
-    """The field of that drive."""
+    """The field of --drive."""
     frames: int = 24
-    """At most so many frames of it."""
+    """Largest number of frames of --drive to measure."""
     cells: Annotated[Path, FOLDER] = Path("out/size")
-    """Folder of its finished pieces: a stopped run goes on."""
+    """Folder of finished measurements, from which a stopped run goes on."""
     assumptions: Annotated[Assumptions, OmitArgPrefixes] = Assumptions()
     json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
     """Write one JSON object to this file; `-` is standard output."""

@@ -1,4 +1,4 @@
-"""``rfedge train``: posed pictures in, a radiance field out."""
+"""``rfedge train``: train a radiance field from posed pictures."""
 
 from __future__ import annotations
 
@@ -28,102 +28,98 @@ if TYPE_CHECKING:
 __all__ = ["Train", "train_tile"]
 
 SH_RISE = 0.1
-"""Share of the run after which one more band joins: the same quality, in less time."""
+"""Share of the run after which the next degree joins; it saves time at the same quality."""
 TILE_CHECKPOINT_EVERY = 500
-"""Iterations: what a killed worker loses, at most."""
+"""Iterations between checkpoints of a tile: the most that a killed worker loses."""
 DEFAULT_LIMIT = 250_000
-"""Gaussians of a run limited by time: about what two cores train in five minutes."""
+"""Largest set of a run limited by time: about what two cores train in five minutes."""
 HALVED_UNTIL = 0.25
-"""Share of a run limited by time that looks at halved pictures: see docs/how-to/training.md,
-"Sooner"."""
+"""Share of a run limited by time that trains on halved pictures (docs/how-to/training.md)."""
 
 
 @dataclass(frozen=True)
 class Train:
     """Train a radiance field from posed pictures.
 
-    Gaussians start at the dataset's points, at those of --points or --depths, or at random ones in
-    the volume the cameras see. A run limited by iterations gives the same bytes every time,
-    interrupted or not; one limited by --minutes depends on the machine.
+    Gaussians start at the dataset's points, at those of --points or --depths, or at random points
+    in the volume that the cameras see. A run limited by iterations gives the same bytes every time,
+    even if it was interrupted; a run limited by --minutes depends on the machine.
     """
 
     dataset: Annotated[Path, Positional, DATASET]
-    """A dataset's folder, or the file that describes it (transforms.json, COLMAP, KITTI, ...). Or a
-    folder that `rfedge dataset split` made: then every tile is trained."""
+    """A dataset's folder, or the file that describes it (transforms.json, COLMAP, KITTI, ...). Of a
+    folder that `rfedge dataset split` made, every tile is trained."""
     out: Annotated[Path, arg(metavar="FILE.rff|FOLDER")]
-    """The field archive to write; of tiles the folder of their archives, which keeps what is
-    done."""
+    """The field archive to write; for tiles, a folder, in which finished tiles are kept."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Train tiles at the same time on the Ray at this address, or on one started here: local. Each
-    takes --threads cores; the fields are the same bytes. Needs rfedge[ray]."""
+    """Train tiles in parallel on the Ray cluster at this address; local starts one here. Each tile
+    takes --threads cores. The fields have the same bytes. Needs the extra ray."""
     held_out: Annotated[Path | None, DATASET] = None
-    """Another dataset of the same place to measure on, never trained on."""
+    """Another dataset of the same place, for measuring only."""
     holdout: Annotated[int | None, arg(metavar="N")] = None
-    """Measure on every Nth picture of the dataset, and do not train on those."""
+    """Measure on every Nth picture of the dataset, and train on the others."""
     views_percent: float = 100.0
-    """Train on this share of the pictures, evenly spread."""
+    """Share of the pictures to train on, evenly spread."""
     points: Annotated[Path | None, PLY] = None
-    """A .ply of coloured surface points, when the dataset does not name one."""
+    """A .ply file of coloured surface points, instead of the dataset's own."""
     depths: Annotated[Path | None, FOLDER] = None
     """A folder of depth maps to take points from: NAME.npy in metres or 16-bit NAME.png in mm."""
     size: Annotated[str | None, SIZE] = None
     """Reduce pictures to WIDTHxHEIGHT, in pixels."""
     undistort: bool = False
-    """Take a lens's distortion out of the pictures; without this such pictures are refused."""
+    """Remove lens distortion from the pictures; otherwise distorted pictures are refused."""
     minutes: float | None = None
-    """Train for so long instead of a number of iterations."""
+    """Length of the training in minutes, instead of a number of iterations."""
     iterations: int | None = None
     """Training iterations, one picture each; default: the trainer's own."""
     gaussians: int | None = None
-    """At most how many Gaussians to start with, drawn from the points at random."""
+    """Largest number of Gaussians to start with, drawn from the points at random."""
     sky: Annotated[int, arg(metavar="DIRECTIONS")] = 0
-    """Start Gaussians of the sky too, 100 km away, in those of so many directions in which all
-    pictures show the same: 60000 for a street under clouds. 0: none. They come beside --gaussians,
-    and count where --limit says how far the set may grow."""
+    """Also start Gaussians of the sky, 100 km away: try this number of directions, and take those
+    in which all pictures show the same colour. 60000 suits a street under clouds; 0: none. They are
+    added to --gaussians and count for --limit."""
     limit: int | None = None
-    """Density control: let the set grow to so many Gaussians, replacing those that show nothing;
-    default: 250000 with --minutes, else the set stays as it is."""
+    """Density control: let the set grow to this number of Gaussians, and replace those that show
+    nothing. Default: 250000 with --minutes, otherwise the set does not grow."""
     sh_degree: int = 3
-    """Bands of the colour's dependence on direction, 0..3."""
+    """Degree of the spherical harmonics of colours, 0..3."""
     antialiased: bool = False
-    """Splats made fainter where they are smaller than a pixel; for pictures of several sizes."""
+    """Draw splats smaller than a pixel fainter; for pictures of several sizes."""
     seed: int = 1
     """Seed of every random choice."""
     threads: int = 2
     """Threads of the rasterizer."""
     name: Annotated[str, arg(metavar="NAME")] = "field"
-    """A name kept in the archive's header."""
+    """Name in the archive's header."""
     plain: bool = False
-    """Write parameters as they were trained: no lower levels of detail, no compression."""
+    """Write the parameters as trained, without lower levels of detail and compression."""
     max_mb: float | None = None
-    """Write the best field of at most so many MB (10^6 bytes)."""
+    """Largest size of the field, MB (10^6 bytes)."""
     passes: int | None = None
-    """Write the size with the fewest bytes of field and stream over so many passes of the held-out
-    pictures, which are coded against every size; of those within --max-mb if both are given."""
+    """Choose the size with the fewest bytes of field and stream over this number of passes through
+    the held-out pictures; --max-mb limits the choice."""
     checkpoint_every: int = 0
-    """Write OUT.ckpt every so many iterations; 0: never."""
+    """Iterations between two writes of OUT.ckpt; 0: never."""
     resume: bool = False
-    """Go on after OUT.ckpt."""
+    """Go on from OUT.ckpt."""
     json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
-    """Write the result as JSON to this file, or to standard output for "-"."""
+    """Write the result as JSON to this file; `-` is standard output."""
     report: Annotated[Path | None, arg(metavar="FILE.html")] = None
-    """Write a page with held-out pictures and the curve of quality over time; needs --holdout or
-    --held-out."""
+    """Write a page with held-out pictures and quality over time; needs --holdout or --held-out."""
     view: Annotated[str | None, arg(metavar="HOST:PORT")] = None
-    """Show the splats in a browser while they are trained, and the pictures of --held-out beside
-    them: 127.0.0.1:8080; elsewhere than on this machine with the environment's
-    RFEDGE_TWIN_TOKEN (docs/how-to/twin.md)."""
+    """Show the splats in a browser while they are trained, beside the pictures of --held-out:
+    127.0.0.1:8080. Other addresses need RFEDGE_TWIN_TOKEN (docs/how-to/twin.md)."""
     refine_poses: bool = False
-    """Learn the pictures' poses with the field, and write them to OUT.tum; for poses of GNSS or
-    odometry. Held-out pictures are measured at aligned poses as well."""
+    """Refine the pictures' poses with the field, and write them to OUT.tum; for poses of GNSS or
+    odometry. Held-out pictures are measured at aligned poses, too."""
     align_held_out: bool = False
-    """Measure held-out pictures also at poses aligned with the field, to compare with
+    """Measure held-out pictures also at poses aligned with the field, to compare a run with one of
     --refine-poses."""
     kind: Literal["splats", "ngp"] = "splats"
-    """3D Gaussians, or the hash grid of Instant-NGP, which takes none of their settings."""
+    """3D Gaussians, or the hash grid of Instant-NGP; options of Gaussians do not apply to it."""
 
     def run(self) -> None:
-        """Train, write the archive and what was asked for beside it; of every tile of a split."""
+        """Train the dataset, or every tile of a split, and write the files that were asked for."""
         from rich.console import Console
 
         from rfcore.errors import InvalidInput
@@ -142,8 +138,7 @@ class Train:
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
         from rfedge.results import write_result
-        from rfedge.training.finish import training_result
-        from rfedge.training.run import train
+        from rfedge.training.run import train, training_result
 
         if self.out.suffix != ".rff":
             raise InvalidInput("out", f"{self.out} must end in .rff")
@@ -175,7 +170,7 @@ class Train:
             console.print(f"{self.report}: held-out pictures and the curve over time")
 
     def _train_tiles(self, tiles: tuple[SplitTile, ...]) -> None:
-        """Train every tile into ``out``, which becomes a folder for `rfedge field publish`."""
+        """Train every tile into ``out``, a folder that `rfedge field publish` takes."""
         import shutil
 
         from rfcore.extras import require
@@ -203,7 +198,7 @@ class Train:
             raise InvalidInput("out", f"{self.out} must be a folder: every tile has a field")
 
     def _tile_job(self, name: str) -> Job:
-        """Return the job that trains a tile: it says what the bytes of its field depend on."""
+        """Return the job that trains a tile, with all that the bytes of its field depend on."""
         from hashlib import sha256
 
         from rfedge.jobs import Job
@@ -230,7 +225,7 @@ class Train:
 
     @contextmanager
     def _shown(self, console: Console) -> Iterator[Snapshots | None]:
-        """Serve the page that --view asks for; yield what writes its snapshots."""
+        """Serve the page of --view, if it is asked for; yield the writer of its snapshots."""
         if self.view is None:
             yield None
             return
@@ -264,7 +259,7 @@ class Train:
         )
 
     def training_job(self) -> TrainingJob:
-        """Return what is to be trained, and how."""
+        """Return the pictures, the settings and the limits of the training."""
         from rfedge.training.loop import LoopLimits
         from rfedge.training.run import TrainingJob
 

@@ -1,7 +1,7 @@
-"""How many vehicles a server carries: prerecorded or live ones, each on its own link.
+"""Load tests: how many vehicles, each on its own link, a server carries.
 
-``run`` starts the processes: a server, the links, and the fleet. Prerecorded vehicles (``fleet``)
-replay packets that were coded once, so that the machine's time goes to the server; live ones are
-``cav-agent`` processes. Latency is counted from the moment a picture was due, whatever became of
-those before it (no coordinated omission), until its Ack arrives.
+``run`` starts the processes: a server, the links, and the vehicles. Prerecorded vehicles
+(``fleet``) replay packets that were coded once, so that the machine's time goes to the server. Live
+vehicles are ``cav-agent`` processes. The latency of a picture is counted from the moment it was due
+until its Ack arrives, even if the pictures before it were late (no coordinated omission).
 """

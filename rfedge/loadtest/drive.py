@@ -1,10 +1,10 @@
-"""Drive vehicles to a server, and measure what all processes of the test use meanwhile.
+"""Run the vehicles of a load test, and measure what all its processes use.
 
-Prerecorded vehicles are one process, the fleet. Live ones are ``cav-agent`` processes that read,
-render, encode and send in real time. Their latencies count from the capture of a picture: an agent
-whose event loop is late captures late, whereas the fleet counts from when a picture was due.
+Prerecorded vehicles are one process, the fleet. Live vehicles are ``cav-agent`` processes that
+read, render, encode and send in real time. Their latency counts from the capture of a picture: an
+agent whose event loop is late captures late, whereas the fleet counts from when a picture was due.
 
-``measured`` turns what came of a run into what ``verdict`` judges.
+``measured`` turns the measurements of a run into the input of ``verdict``.
 """
 
 from __future__ import annotations
@@ -42,30 +42,29 @@ __all__ = [
 
 @dataclass(frozen=True)
 class VehicleReport:
-    """One vehicle in the counted part of a run.
-
-    ``due``: pictures that were due; ``latency_ms``: of those acknowledged; ``nacked``: how many the
-    server refused; ``granted_hz``: the rate it admitted (0: any); ``refused``: why it did not admit
-    the vehicle, ``failed``: why the vehicle lost its stream (both empty if it did not).
-    """
+    """One vehicle in the measured part of a run."""
 
     due: int
+    """Number of pictures that were due."""
     latency_ms: Sequence[float]
+    """Latencies of the pictures that were acknowledged."""
     nacked: int = 0
+    """Number of pictures that the server refused."""
     granted_hz: float = 0.0
+    """Rate that the server admitted; 0: any."""
     refused: str = ""
+    """Why the server did not admit the vehicle; empty if it did."""
     failed: str = ""
+    """Why the vehicle lost its stream; empty if it did not."""
 
 
 @dataclass(frozen=True)
 class RunMeasurements:
-    """Reports of the vehicles, and use of the processes over the counted part.
-
-    ``generator_lag_ms``: 99th percentile of how late the fleet's event loop was.
-    """
+    """Reports of the vehicles, and use of the processes over the measured part."""
 
     vehicles: Sequence[VehicleReport]
     generator_lag_ms: float
+    """99th percentile of how late the fleet's event loop was."""
     usage: Mapping[str, Usage]
     machine_busy: float
     hz: float
@@ -77,7 +76,7 @@ class RunMeasurements:
         return max(0.0, self.machine_busy * (psutil.cpu_count() or 1) - ours)
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields of ``LoadRow`` that count vehicles and resources."""
+        """Return the fields of ``LoadRow`` about vehicles and resources."""
         cores = {name: usage.cores for name, usage in self.usage.items()}
         return {
             "refused": sum(bool(vehicle.refused) for vehicle in self.vehicles),
@@ -95,7 +94,7 @@ class RunMeasurements:
 
 
 def measured(load: Load, run: RunMeasurements, link_busy: float, workers: int) -> Measured:
-    """Return what is judged: the vehicles that were admitted, and how busy everything was."""
+    """Return the measurements to judge: of the admitted vehicles, and how busy everything was."""
     deadline_ms = load.bounds.deadline_ms
     counts = [
         VehicleCount(v.due, sum(ms <= deadline_ms for ms in v.latency_ms), v.latency_ms)
@@ -128,14 +127,14 @@ def links_busy(report: Path, load: Load) -> float:
 
 
 START_S = 60.0
-"""How long the fleet may take to start, and to write its result, on a busy machine."""
+"""Time that the fleet may take to start, and to write its result, on a busy machine."""
 POLL_S = 0.02
 
 
 def drive_prerecorded(
     load: Load, addresses: Sequence[str], pids: Mapping[str, int], work: Path, folder: Path
 ) -> RunMeasurements:
-    """Drive prerecorded vehicles to ``addresses``; raise ``RfedgeError`` if the fleet fails."""
+    """Run prerecorded vehicles towards ``addresses``; raise ``RfedgeError`` if the fleet fails."""
     spec = FleetSpec(
         addresses=tuple(addresses),
         hz=load.hz,
@@ -193,7 +192,7 @@ def drive_live(
     work: Path,
     agent: Sequence[str],
 ) -> RunMeasurements:
-    """Drive agents to ``addresses``; raise ``RfedgeError`` if one ends early."""
+    """Run agents towards ``addresses``; raise ``RfedgeError`` if one ends early."""
     reports = [work / f"agent{i}.jsonl" for i in range(load.vehicles)]
     for report in reports:
         report.unlink(missing_ok=True)
@@ -261,6 +260,6 @@ def _await_first_pictures(
 
 
 def _together(usages: Sequence[Usage]) -> Usage:
-    """Return the vehicles as one: what they use, summed sample by sample."""
+    """Return the use of several processes, summed sample by sample."""
     together = zip(*(usage.samples for usage in usages), strict=False)
     return Usage([sum(samples[1:], samples[0]) for samples in together])

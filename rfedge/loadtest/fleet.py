@@ -1,8 +1,8 @@
 """The fleet of prerecorded vehicles: one process, one stream (and connection) a vehicle.
 
 ``python -m rfedge.loadtest.fleet SPEC RESULT``: both are JSON. All vehicles connect before the
-first picture is due; their pictures are due at times spread evenly over a period, as those of
-vehicles that know nothing of each other, or all at the same.
+first picture is due. Their pictures are due at times spread evenly over a period, as if the
+vehicles knew nothing of each other.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ SETTLE_S = 0.2
 
 @dataclass(frozen=True)
 class FleetSpec:
-    """Where each vehicle connects, what it sends, and when.
-
-    ``drive``: the folder of a prerecorded drive.
-    """
+    """The vehicles of a fleet, with the fields of ``Load`` that concern them."""
 
     addresses: tuple[str, ...]
+    """The server's or link's HOST:PORT for each vehicle."""
     hz: float
     cameras: int
     warm_up_s: float
     duration_s: float
     ready_s: float
+    """Time from the moment a picture is due until it is ready to send."""
     drive: str
+    """Folder of a prerecorded drive."""
 
 
 @dataclass(frozen=True)
 class Departure:
-    """When the whole fleet starts, and how its pictures are spread over a period.
+    """The start of the whole fleet, and how its pictures are spread over a period.
 
-    Those of vehicle i are due a share i / N of a period later, but for the first half of the
-    warm-up, when all are due together: every worker of the server then renders, and has its scratch
-    memory (40 MB) before it counts, instead of whenever two pictures happen to meet.
+    Pictures of vehicle i are due i / N of a period later. In the first half of the warm-up all are
+    due together, so that every worker of the server renders and allocates its scratch memory
+    (40 MB) before the measurement begins.
     """
 
     start_s: float
@@ -76,7 +76,7 @@ def _hello(spec: FleetSpec, drive: PrerecordedDrive) -> Hello:
 
 
 class LagProbe:
-    """How late this process's own event loop is: sleeps of 10 ms that took longer."""
+    """Measures how late this process's event loop is, by sleeps of 10 ms that take longer."""
 
     PERIOD_S = 0.01
 

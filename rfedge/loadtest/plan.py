@@ -1,4 +1,4 @@
-"""The plan of a load test: what is put on a server, and the bounds within which it is held."""
+"""The plan of a load test: the load on a server, and the bounds within which it is held."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ __all__ = ["Bounds", "Load", "Mode", "Vehicles"]
 
 
 class Mode(StrEnum):
-    """How much of its work the server does for each frame.
+    """The part of its work that the server does for each frame.
 
     ``transport``: everything but the numerical work; frames are parsed, checked (order, CRC),
-    queued to a worker (there is one), acknowledged, counted. ``receiver``: decoding too, against
+    queued to a worker (there is one), acknowledged and counted. ``receiver``: decoding too, against
     renders cached by pose. ``full``: ``mec-server`` as it is.
     """
 
@@ -35,19 +35,18 @@ class Vehicles(StrEnum):
 
 @dataclass(frozen=True)
 class Bounds:
-    """When a load is held.
-
-    Of all pictures that were due, ``on_time_percent`` are acknowledged within ``deadline_ms``; so
-    are 99 % of those that were acknowledged; the worst vehicle has at least ``fairness`` of the
-    best one's share in time; the server's memory grows less than ``growth_mb_per_minute``, beyond
-    ``settling_mb`` that its allocators take at any time.
-    """
+    """The bounds of a load that is held."""
 
     deadline_ms: float = 100.0
+    """Limit of a picture's latency, and of the 99th percentile of those acknowledged."""
     on_time_percent: float = 99.0
+    """Least share of all pictures due that are acknowledged within the deadline."""
     fairness: float = 0.5
+    """Least ratio of the worst vehicle's share on time to the best vehicle's."""
     growth_mb_per_minute: float = 1.0
+    """Largest growth of the server's memory, beyond ``settling_mb``."""
     settling_mb: float = 8.0
+    """Memory that the server's allocators may take at any time."""
 
     def __post_init__(self) -> None:
         if not self.deadline_ms > 0:
@@ -60,30 +59,30 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Load:
-    """``vehicles`` of ``cameras`` cameras at ``hz`` pictures per second, for ``duration_s``.
-
-    Pictures that are due in the first ``warm_up_s`` are sent and not counted: a server keeps those
-    of the last 7 s (``mec_server.twin.state``), and its memory grows until it has them. ``link``: a
-    profile, of which each vehicle gets a link of its own; None: loopback. ``size_bytes``: payload
-    of a frame in transport mode; other modes send what the encoder made of the drive.
-    ``vehicle_ms``: how long a prerecorded vehicle waits before it sends a picture, in place of the
-    encoding time of a real one. ``admission``: whether the server may refuse vehicles or lower
-    their rate; it may not by default, so that its limit can be seen. ``render``: threads and
-    renderer of a server at full work and of live vehicles.
-    """
+    """A number of vehicles that send pictures to a server for some time."""
 
     mode: Mode
     vehicles: int
     hz: float
+    """Pictures per second of each camera."""
     duration_s: float = 20.0
+    """Time that is measured."""
     warm_up_s: float = 10.0
+    """Time before it that is not: a server keeps the pictures of the last 7 s
+    (``mec_server.twin.state``), and its memory grows until it has them."""
     cameras: int = 1
+    """Cameras of each vehicle."""
     size_bytes: int = 4096
+    """Payload of a frame in transport mode; other modes send the frames of a coded drive."""
     link: Path | None = None
+    """Profile of the link of each vehicle; None: loopback."""
     kind: Vehicles = Vehicles.PRERECORDED
     vehicle_ms: float = 0.0
+    """Time that a prerecorded vehicle waits before it sends a picture, in place of encoding."""
     admission: bool = False
+    """Whether the server may refuse vehicles or lower their rate; otherwise its limit shows."""
     render: RenderSettings = RenderSettings()
+    """Threads and renderer of a server in full mode and of live vehicles."""
     bounds: Bounds = Bounds()
 
     def __post_init__(self) -> None:

@@ -5,11 +5,10 @@ from the one before, and ``alone``, predicted from the render only, for the pict
 was dropped. On disk they are two coded drives (``rfcore.wire.drive_file``), in a folder named by
 the digest of field, drive and settings.
 
-``Replay`` is one camera of a vehicle that replays a drive: what is due when, what is sent, and how
-each picture ended. Sans-IO; times are seconds on one monotonic clock. Pictures are due at
-``start_s + i / hz`` whatever became of those before. As in the agent, the newest waits for credit
-and replaces the one that waited. After a picture that was dropped or refused the next ones are sent
-alone, in a new epoch, until the drive begins again.
+``Replay`` is one camera of a vehicle that replays a drive. It does no I/O; times are seconds on one
+monotonic clock. Pictures are due at ``start_s + i / hz``, even if those before are late. As in the
+agent, the newest picture waits for credit and replaces the one that waited. After a picture that
+was dropped or refused, the next ones are sent alone, in a new epoch, until the drive begins again.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ __all__ = [
 
 
 class End(StrEnum):
-    """How a picture ended; ``open``: it was not answered when the test was over."""
+    """The fate of a picture; ``open``: it was not answered when the test was over."""
 
     ACKED = "acked"
     NACKED = "nacked"
@@ -67,20 +66,20 @@ class End(StrEnum):
 
 @dataclass
 class Shot:
-    """One picture: when it was due, when it was handed to the socket, when it was answered.
-
-    ``is_exact``: the server's picture is the vehicle's, byte for byte.
-    """
+    """One picture and its fate."""
 
     due_s: float
     sent_s: float | None = None
+    """The time at which it was handed to the socket."""
     ended_s: float | None = None
+    """The time at which it was answered or dropped."""
     end: End = End.OPEN
     is_exact: bool = False
+    """Whether the server's picture is the vehicle's, byte for byte."""
 
     @property
     def latency_s(self) -> float | None:
-        """From due to Ack."""
+        """Time from due to Ack, or None without one."""
         if self.end is not End.ACKED or self.ended_s is None:
             return None
         return self.ended_s - self.due_s
@@ -124,7 +123,7 @@ class Replay:
         self._used = 0
         self._waiting: int | None = None
         self._pending: dict[FrameAddress, tuple[Shot, bytes]] = {}
-        """Of pictures that were not answered; the digest is of what the vehicle decoded."""
+        """Pictures that are not answered yet, with the digest of the vehicle's reconstruction."""
         self._epoch = -1
         self._sequence = 0
         self._chained = False
@@ -140,7 +139,7 @@ class Replay:
         return self._waiting is not None and self._used < self._granted
 
     def begin(self, schedule: Schedule) -> None:
-        """Follow ``schedule`` from now on; before, nothing is due."""
+        """Follow ``schedule`` from now on; before this nothing is due."""
         self._schedule = schedule
 
     def get_timer(self) -> float | None:
@@ -149,7 +148,7 @@ class Replay:
         return None if due_s >= self._schedule.end_s else due_s + self._schedule.ready_s
 
     def frame_to_send(self, now: float) -> Frame | None:
-        """Return the frame to hand to the socket now, or None: not due, or no credit."""
+        """Return the frame to send now, or None if none is due or has credit."""
         while (timer := self.get_timer()) is not None and timer <= now:
             if self._waiting is not None:
                 self._drop(self._waiting, now)
@@ -162,7 +161,7 @@ class Replay:
         return self._sent(index, now)
 
     def receive(self, message: ServerMessage, now: float) -> None:
-        """Take an answer; answers for other cameras are not ours."""
+        """Take an answer; answers for other cameras are ignored."""
         match message:
             case Credit(camera_id, frames) if camera_id == self._camera_id:
                 self._granted = max(self._granted, frames)
@@ -175,7 +174,7 @@ class Replay:
                 self._chained = False
 
     def give_up(self) -> None:
-        """The stream is lost: what was still to come is dropped."""
+        """Drop the pictures that were still to come, since the stream is lost."""
         while self._schedule.due_s(len(self.shots)) < self._schedule.end_s:
             self.shots.append(Shot(self._schedule.due_s(len(self.shots)), end=End.DROPPED))
 
@@ -207,7 +206,10 @@ class Replay:
 
 
 def _numbered(packet: DeltaPacket, epoch: int, sequence: int) -> DeltaPacket:
-    """Return the packet under other numbers, sealed; written out, as ``replace`` takes twice."""
+    """Return the packet with other numbers and a new CRC.
+
+    The fields are written out because ``dataclasses.replace`` takes twice the time.
+    """
 
     def numbered(crc32: int) -> DeltaPacket:
         return DeltaPacket(
@@ -242,23 +244,23 @@ class PrerecordedDrive:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """The camera's."""
+        """The camera's intrinsics."""
         return self.hello.cameras[0].intrinsics
 
     @property
     def mean_payload_bytes(self) -> float:
-        """Of the frames as a vehicle sends them."""
+        """Mean payload of the frames of the chain."""
         return sum(len(frame.packet.payload) for frame in self.chain) / len(self.chain)
 
     def write(self, folder: Path) -> None:
-        """Keep the drive in ``folder``."""
+        """Write the drive into ``folder``."""
         folder.mkdir(parents=True, exist_ok=True)
         write_drive(folder / "chain.rfv", CodedDrive(self.hello, self.chain))
         write_drive(folder / "alone.rfv", CodedDrive(self.hello, self.alone))
 
     @staticmethod
     def read(folder: Path) -> PrerecordedDrive:
-        """Read what ``write`` wrote; raise ``InvalidData`` if it is damaged."""
+        """Read a drive from ``folder``; raise ``InvalidData`` if it is damaged."""
         chain, alone = read_drive(folder / "chain.rfv"), read_drive(folder / "alone.rfv")
         return PrerecordedDrive(chain.hello, chain.frames, alone.frames)
 

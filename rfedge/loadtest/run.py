@@ -1,4 +1,4 @@
-"""One run: server, links and fleet as processes, measured over the counted part."""
+"""One run of a load test: server, links and vehicles as processes."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ __all__ = ["LoadRow", "Run", "TestBed", "recorded", "run_load"]
 
 @dataclass(frozen=True)
 class TestBed:
-    """What loads are run on."""
+    """The field, the drive and the folders of load tests."""
 
     field: Path
-    """The archive, the only one in its folder."""
+    """The field's archive, which is alone in its folder."""
     drive: Path
-    """The drive whose pictures are sent."""
+    """The drive whose pictures the vehicles send."""
     workers: int
-    """Threads of the server."""
+    """Frames that the server reconstructs at once."""
     cache: Path
     """Folder that keeps prerecorded drives."""
     work: Path
@@ -51,7 +51,7 @@ class TestBed:
 
 @dataclass(frozen=True)
 class LoadRow:
-    """One load and what became of it. Latencies are None when nothing was acknowledged.
+    """One load and its measurements; latencies are None when nothing was acknowledged.
 
     ``*_cores`` are CPU seconds per second; ``server_loop_cores`` those of the server's event loop.
     """
@@ -76,7 +76,7 @@ class LoadRow:
     """``prerecorded`` or ``live`` vehicles."""
     cameras: int
     payload_bytes: float
-    """Mean of a frame."""
+    """Mean payload of a frame."""
     link: str | None
     """Name of the link profile; None: loopback."""
     duration_s: float
@@ -97,7 +97,7 @@ class LoadRow:
     """99th percentile of how late the generator's event loop was."""
     renderer: str = CPU
     threads: int = 1
-    """Of a render."""
+    """Threads of a render."""
     run: int | None = None
     """Number of the run, from 1, where a load is repeated."""
 
@@ -141,7 +141,7 @@ def run_load(load: Load, bed: TestBed) -> Run:
 
 
 def recorded(load: Load, bed: TestBed) -> Path:
-    """Return the folder of what the load's vehicles send, coded now if it is new."""
+    """Return the folder of the drive that the vehicles send, coded now if it is new."""
     field = load_field(bed.field)
     if load.mode is not Mode.TRANSPORT:
         return prerecorded_drive(bed.drive, field, bed.cache, bed.effort, bed.crf)
@@ -162,8 +162,11 @@ def _server(load: Load, bed: TestBed) -> Any:
 
 
 def _workers(load: Load, bed: TestBed) -> int:
-    """Return one in transport mode: with nothing to compute, more only compete for Python's lock
-    (p99 of 100 vehicles at 30 Hz: 86 and 41 ms with two, 31 and 15 ms with one)."""
+    """Return the number of workers; one in transport mode.
+
+    With nothing to compute, more workers only compete for Python's lock: the 99th percentile of
+    100 vehicles at 30 Hz was 86 and 41 ms with two, 31 and 15 ms with one.
+    """
     return 1 if load.mode is Mode.TRANSPORT else bed.workers
 
 
@@ -217,5 +220,5 @@ def _row(
 
 
 def _finite(ms: float) -> float | None:
-    """Return None for a percentile of nothing, which is infinite."""
+    """Return None for the percentile of an empty list, which is infinite."""
     return ms if math.isfinite(ms) else None

@@ -1,4 +1,4 @@
-"""The server of a load test without some of its work: ``mec_server.server``, served by itself.
+"""``mec-server`` without a part of its work, for load tests of the rest.
 
 ``python -m rfedge.loadtest.server transport|receiver FIELDS WORKERS --ready-file FILE``
 
@@ -40,7 +40,7 @@ MAX_KEPT = 64
 
 
 class PassingDecoder:
-    """Takes frames without looking at their pictures."""
+    """Shows a grey picture for every frame."""
 
     def __init__(self, camera: CameraDescription) -> None:
         self._grey = I420.filled((camera.intrinsics.width_px, camera.intrinsics.height_px))
@@ -55,7 +55,7 @@ class PassingDecoder:
 
 
 class KeptRenders:
-    """A field whose renders are kept; shared by the sessions, each pose of which is the same."""
+    """A field that keeps its renders, for sessions that all ask for the same poses."""
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
@@ -72,7 +72,7 @@ class KeptRenders:
 
 
 class KeptFields:
-    """The fields of a server, each once and with its kept renders."""
+    """The fields of a server, each opened once, with its kept renders."""
 
     def __init__(self, fields: FieldSource) -> None:
         self._fields = fields
@@ -86,7 +86,7 @@ class KeptFields:
 
 
 def passing(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
-    """Return decoders that do nothing, for ``mec_server.reconstruction.open_cameras``."""
+    """Return decoders that do nothing, in place of ``mec_server.reconstruction.open_cameras``."""
     del fields, tools
     return {camera.camera_id: PassingDecoder(camera) for camera in job.hello.cameras}
 
@@ -111,7 +111,7 @@ def main(arguments: list[str]) -> None:
         listen="127.0.0.1:0",
         workers=int(workers),
         admission=AdmissionLimits(load=0.0),
-        server_budget=ServerBudget(decoders=100_000),  # it has none: nothing is to be kept free
+        server_budget=ServerBudget(decoders=100_000),  # so that no vehicle is refused
         ready_file=Path(ready_file),
         address_connections=0,  # every vehicle of the test is at one address
     )

@@ -1,8 +1,8 @@
-"""What processes use while a load test runs: CPU, memory, descriptors, threads.
+"""Measure the CPU time, memory, descriptors and threads of processes during a load test.
 
-A process is counted with its children (the server's decoders are some). The event loop of every
-process here runs on its first thread, whose CPU time is told apart: Python lets no other thread of
-the process run Python meanwhile.
+A process is counted with its children, such as the server's decoders. The CPU time of its first
+thread is counted apart, because the event loop runs on it, and while it runs no other thread of the
+process can run Python.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ EVERY_S = 0.5
 
 @dataclass(frozen=True)
 class Sample:
-    """One process with its children at one moment; CPU in seconds since its start."""
+    """One process with its children at one moment; CPU time in seconds since its start."""
 
     at_s: float
     cpu_s: float
@@ -36,7 +36,7 @@ class Sample:
     children: int
 
     def __add__(self, other: Sample) -> Sample:
-        """Return two processes as one, at this one's moment."""
+        """Return the sum of two processes, at the first one's moment."""
         return Sample(
             self.at_s,
             self.cpu_s + other.cpu_s,
@@ -66,7 +66,7 @@ class Usage:
 
     @property
     def growth_mb(self) -> float:
-        """How much memory the second half's mean is above the first's, as if over the whole."""
+        """Growth of memory over the whole time, from the means of its two halves."""
         rss_mb = [sample.rss_mb for sample in self.samples]
         half = len(rss_mb) // 2
         if not half:
@@ -94,12 +94,12 @@ class Watcher:
         self._thread = threading.Thread(target=self._run, name="watcher", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Begin to sample."""
         self._machine_at_start = _machine_seconds()
         self._thread.start()
 
     def stop(self) -> Mapping[str, Usage]:
-        """End, and return the samples of each process."""
+        """Stop, and return the samples of each process."""
         self._stopped.set()
         self._thread.join()
         self._machine_at_end = _machine_seconds()
@@ -107,7 +107,7 @@ class Watcher:
 
     @property
     def machine_busy(self) -> float:
-        """Share of the machine's CPU time that was used, by whomever, from start to stop."""
+        """Share of the machine's CPU time that all processes used from start to stop."""
         busy_s, all_s = (
             end - start
             for start, end in zip(self._machine_at_start, self._machine_at_end, strict=True)
@@ -147,7 +147,7 @@ def sample(process: psutil.Process) -> Sample:
 
 
 def _machine_seconds() -> tuple[float, float]:
-    """Return the seconds all cores were busy, and all they had, since boot."""
+    """Return the busy time and the whole time of all cores since boot, s."""
     times = psutil.cpu_times()
     idle_s = times.idle + times.iowait
     whole_s = sum(times) - times.guest - times.guest_nice

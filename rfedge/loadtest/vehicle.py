@@ -1,7 +1,7 @@
-"""One prerecorded vehicle on a connection of its own: replays pictures on time, counts the answers.
+"""One prerecorded vehicle on its own connection: it replays pictures on time and counts answers.
 
-Everything happens in calls of the event loop (bytes came, a picture is due): no task and no future
-a frame, so that one process plays a hundred vehicles in a small part of a core.
+Everything happens in callbacks of the event loop (bytes arrived, a picture is due), without a task
+or a future for each frame, so that one process plays a hundred vehicles in half a core.
 """
 
 from __future__ import annotations
@@ -30,10 +30,12 @@ CODES = {code.value[0]: code.name for code in grpc.StatusCode}
 
 
 class PrerecordedVehicle(asyncio.Protocol):
-    """``met`` is set when the server has answered Hello, ``over`` when nothing more will happen.
+    """A vehicle that replays a drive for each of its cameras.
 
-    ``tls``: how it proves who it is and speaks HTTP/2 (ALPN); None: without TLS. ``on_notice`` is
-    called with what it is told of the street, if its Hello takes that.
+    ``met`` is set when the server has answered Hello, ``over`` when nothing more will happen.
+    ``refused`` and ``failed`` say why the server did not admit the vehicle or why its stream was
+    lost. ``tls`` has the vehicle's certificate and ALPN for HTTP/2; None: no TLS. ``on_notice`` is
+    called with the notices of the server, if the Hello asks for them.
     """
 
     def __init__(
@@ -60,9 +62,9 @@ class PrerecordedVehicle(asyncio.Protocol):
         self._departed = False
 
     async def connect(self, within_s: float, source: str = "") -> None:
-        """Say Hello and wait for the answer; what goes wrong is in ``refused`` or ``failed``.
+        """Say Hello and wait for the answer; a problem is in ``refused`` or ``failed``.
 
-        ``source``: the address to come from; without one the kernel chooses.
+        ``source`` is the local address; without one the kernel chooses.
         """
         host, port = self._address.rsplit(":", 1)
         try:
@@ -79,7 +81,7 @@ class PrerecordedVehicle(asyncio.Protocol):
             self._fail(f"{self._address}: {error}")
 
     def depart(self, schedule: Schedule, give_up_s: float) -> None:
-        """Send pictures by ``schedule``; what is not answered by ``give_up_s`` never will be."""
+        """Send pictures by ``schedule``; those not answered by ``give_up_s`` stay open."""
         if 0 < self.granted_hz < schedule.hz:
             schedule = replace(schedule, hz=self.granted_hz)
         if self.refused:
@@ -95,7 +97,7 @@ class PrerecordedVehicle(asyncio.Protocol):
         self._go_on()
 
     def leave(self) -> None:
-        """Close the connection; pictures that were still to come are dropped."""
+        """Close the connection, and drop the pictures that were still to come."""
         if self.over.is_set():
             return
         for replay in self.replays:
@@ -116,7 +118,7 @@ class PrerecordedVehicle(asyncio.Protocol):
         self._flush()
 
     def data_received(self, data: bytes) -> None:
-        """Take answers, and send what waited for them."""
+        """Take answers, and send the frames that waited for them."""
         now, was_blocked = time.monotonic(), self._call.is_blocked
         try:
             for part in self._call.receive(data):
@@ -131,20 +133,18 @@ class PrerecordedVehicle(asyncio.Protocol):
             self._flush()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The server, or the way to it, is gone."""
+        """Note that the connection is lost."""
         if not self.over.is_set() and not self.refused:
             self._fail(f"connection lost: {exc or 'closed by the server'}")
 
     def pause_writing(self) -> None:
-        """The socket takes no more."""
+        """Stop writing: the socket's buffer is full."""
         self._is_full = True
 
     def resume_writing(self) -> None:
-        """The socket takes more."""
+        """Go on writing: the socket's buffer has room."""
         self._is_full = False
         self._go_on()
-
-    # --- what happens
 
     def _take(self, data: bytes, now: float) -> None:
         for message in server_messages_from_bytes(data):
@@ -157,7 +157,7 @@ class PrerecordedVehicle(asyncio.Protocol):
                 self.met.set()
 
     def _go_on(self) -> None:
-        """Send what is due and may be sent, and come back when the next picture is due."""
+        """Send the frames that are due and have credit, and set the timer for the next one."""
         if self.over.is_set():
             return
         now = time.monotonic()
@@ -172,7 +172,7 @@ class PrerecordedVehicle(asyncio.Protocol):
             self._set_alarm()
 
     def _set_alarm(self) -> None:
-        """Come back when the next picture is due, unless the server has to read first."""
+        """Set the timer for the next picture, unless the server has to read first."""
         if self._alarm is not None:
             self._alarm.cancel()
             self._alarm = None

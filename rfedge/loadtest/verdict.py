@@ -1,11 +1,11 @@
 """The verdict on one run: whether the load was held, and which resource limits it.
 
-A frame is on time when its Ack was back within the deadline, counted from the moment the picture
-was due. Frames that were dropped, refused or unanswered were not on time.
+A frame is on time when its Ack arrives within the deadline, counted from the moment the picture
+was due. Frames that were dropped, refused or not answered are late.
 
 Every resource has a utilisation above which work queues up for it. If a bound was broken, the first
-resource above its own is named, else the one nearest to it. The load generator comes first: where
-the test's own vehicles are the limit, the run says nothing about the server.
+resource above its limit is named, otherwise the resource nearest to its limit. The load generator
+comes first: where the test's own vehicles are the limit, the run says nothing about the server.
 """
 
 from __future__ import annotations
@@ -13,14 +13,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
-from rfcore.extras import needs
 from rfedge.loadtest.plan import Bounds
-
-with needs("loadtest"):
-    from scipy.stats import binomtest
 
 __all__ = [
     "Measured",
@@ -42,33 +39,34 @@ MACHINE_BUSY = 0.95
 OTHERS = 0.3
 """Cores used by other processes above which a run is not that of an idle machine."""
 LAG_MS = 20.0
-"""Lateness of the generator's event loop above which its own delays are what is measured."""
+"""Lateness of the generator's event loop above which the run measures the generator itself."""
 
 
 @dataclass(frozen=True)
 class Resources:
-    """How busy everything was, as shares of what it has (0..1), and how late the generator was.
-
-    ``server_loop``: the server's event loop, of one core; ``workers``: the server's other threads,
-    of the cores they can have; ``link``: the busiest vehicle's uplink; ``generator``: the busiest
-    process that plays vehicles or links, of one core (0 for live vehicles: they are what is
-    tested). ``machine``: all cores, of which the test's own processes used the share ``test``, and
-    others ``others`` cores.
-    """
+    """The utilisation of every resource, 0..1, and how late the generator was."""
 
     server_loop: float
+    """The server's event loop, as a share of one core."""
     workers: float
+    """The server's other threads, as a share of the cores that they can have."""
     link: float
+    """The uplink of the busiest vehicle."""
     generator: float
+    """The busiest process that plays vehicles or links, as a share of one core; 0 for live
+    vehicles, which are a part of what is tested."""
     machine: float
+    """All cores of the machine."""
     test: float
+    """The share of the machine that the test's own processes used."""
     others: float
+    """Cores that other processes used."""
     generator_lag_ms: float
 
 
 @dataclass(frozen=True)
-class Use:
-    """Utilisation of one resource, its limit, and both in words."""
+class Utilisation:
+    """Utilisation of one resource, its limit, and a text for both."""
 
     text: str
     share: float
@@ -81,9 +79,9 @@ class Use:
 
 
 def limit(resources: Resources) -> str:
-    """Name the first resource that was at its limit and its use, else the one nearest to it."""
+    """Name the first resource above its limit, or the one nearest to it, with its utilisation."""
     r = resources
-    machine = Use(
+    machine = Utilisation(
         f"CPU of the machine, at {_percent(r.machine)}{_beside(r)}", r.machine, MACHINE_BUSY
     )
     uses = (_lag(r), *_on_one_core(r), machine, _workers(r))
@@ -92,35 +90,36 @@ def limit(resources: Resources) -> str:
 
 
 def nearest(resources: Resources) -> str:
-    """Name the resource that a load which was held would break first, and its use.
+    """Name the resource that limits a load that was held, with its utilisation.
 
-    What other processes use of the machine is left out, since they are no part of the test.
+    Other processes on the machine are left out, since they are no part of the test.
     """
     r = resources
-    machine = Use(f"CPU of the machine, at {_percent(r.test)}", r.test, MACHINE_BUSY)
+    machine = Utilisation(f"CPU of the machine, at {_percent(r.test)}", r.test, MACHINE_BUSY)
     return f"nearest: {_fullest((*_on_one_core(r), machine, _workers(r)))}"
 
 
-def _fullest(uses: Sequence[Use]) -> str:
+def _fullest(uses: Sequence[Utilisation]) -> str:
     return max(uses, key=lambda use: use.share / use.limit).text
 
 
-def _on_one_core(r: Resources) -> tuple[Use, ...]:
-    return (
-        Use(f"vehicles of the test, at {_percent(r.generator)} of a core", r.generator, BUSY),
-        Use(f"link of the busiest vehicle, at {_percent(r.link)}", r.link, BUSY),
-        Use(f"server's event loop, at {_percent(r.server_loop)} of a core", r.server_loop, BUSY),
+def _on_one_core(r: Resources) -> tuple[Utilisation, ...]:
+    shares = (
+        ("vehicles of the test, at {} of a core", r.generator),
+        ("link of the busiest vehicle, at {}", r.link),
+        ("server's event loop, at {} of a core", r.server_loop),
     )
+    return tuple(Utilisation(text.format(_percent(share)), share, BUSY) for text, share in shares)
 
 
-def _workers(r: Resources) -> Use:
-    return Use(f"server's workers, at {_percent(r.workers)}", r.workers, BUSY)
+def _workers(r: Resources) -> Utilisation:
+    return Utilisation(f"server's workers, at {_percent(r.workers)}", r.workers, BUSY)
 
 
-def _lag(r: Resources) -> Use:
-    """Lateness of the generator, unless the whole machine was busy."""
+def _lag(r: Resources) -> Utilisation:
+    """Return the lateness of the generator, or 0 if the whole machine was busy."""
     late = r.generator_lag_ms if r.machine < MACHINE_BUSY else 0.0
-    return Use(f"vehicles of the test, {late:.0f} ms late themselves", late, LAG_MS)
+    return Utilisation(f"vehicles of the test, {late:.0f} ms late themselves", late, LAG_MS)
 
 
 def _beside(r: Resources) -> str:
@@ -131,12 +130,13 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-CONFIDENCE = 0.95
+DEVIATIONS = NormalDist().inv_cdf(0.975)
+"""Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 
 
 @dataclass(frozen=True)
 class VehicleCount:
-    """One vehicle's pictures: how many were due and on time, and latencies of the acknowledged."""
+    """Numbers of one vehicle's pictures due and on time, and latencies of those acknowledged."""
 
     due: int
     on_time: int
@@ -145,20 +145,22 @@ class VehicleCount:
 
 @dataclass(frozen=True)
 class Measured:
-    """What is judged of one run. ``growth_mb``: of the server's memory, over ``minutes``."""
+    """The measurements of one run that are judged."""
 
     vehicles: Sequence[VehicleCount]
     wanted_vehicles: int
     growth_mb: float
+    """Growth of the server's memory over ``minutes``."""
     minutes: float
     resources: Resources
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """``broken``: the bounds that were not kept; none means held."""
+    """The judgement of one run."""
 
     broken: Sequence[str]
+    """The bounds that were not kept; the load is held if there are none."""
     p50_ms: float
     p99_ms: float
     on_time_percent: float
@@ -216,12 +218,13 @@ def share_at_least(successes: int, trials: int) -> float:
     """
     if not trials:
         return 0.0
-    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return float(interval.low)
+    share, spread = successes / trials, DEVIATIONS**2 / trials
+    half = math.sqrt(spread * (share * (1 - share) + spread / 4))
+    return max(0.0, (share + spread / 2 - half) / (1 + spread))
 
 
 def _percentiles(latency_ms: Sequence[float]) -> tuple[float, float]:
-    """Return the 50th and the 99th; of nothing, infinity."""
+    """Return the 50th and the 99th percentile; infinity of an empty list."""
     if not latency_ms:
         return math.inf, math.inf
     p50_ms, p99_ms = np.percentile(np.array(latency_ms), (50, 99))

@@ -1,11 +1,11 @@
-"""What an uplink has to carry, and what both ends have to compute, for a vehicle's cameras.
+"""Estimate the uplink and the processor time that a vehicle's cameras need.
 
-Figures are of the steady state: a first frame, and what a camera costs that is lost, come on top.
+The figures hold for the steady state. A first frame, and a camera that is lost, cost more.
 
-The rate at which frames arrive in time follows the link model of the paper. Cameras of a vehicle
-take their pictures at the same instant and share the link first come, first served: a frame of b
-bytes occupies it for 8 b / rate (the delay tau of NetworkTX), behind those that came before. The
-sizes of frames are those of the measured clip, again and again.
+The rate at which frames arrive in time follows the link model of the paper. The cameras of a
+vehicle take their pictures at the same instant and share the link first come, first served: a frame
+of b bytes occupies it for 8 b / rate (the delay tau of NetworkTX). The sizes of the measured clip's
+frames are repeated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from rfcore.errors import InvalidInput
-from rfedge.sizing.tables import SizingCell, SizingTables, Wanted, check_reach, log_at
+from rfedge.sizing.tables import CameraDemand, SizingCell, SizingTables, check_reach, log_at
 
 __all__ = [
     "Assumptions",
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 INSTANTS = 400
-"""How long the link is watched, in pictures of a camera."""
+"""Length of the simulation, in pictures of a camera."""
 PRECISION = 1.005
 MOST_BPS = 1e12
 HEXAGON = math.sqrt(3) / 2
@@ -42,7 +42,7 @@ HEXAGON = math.sqrt(3) / 2
 
 @dataclass(frozen=True)
 class Demand:
-    """A vehicle's cameras, the quality wanted, and optionally in which time frames must arrive.
+    """A vehicle's cameras, the wanted quality, and optionally the time that a frame may take.
 
     ``psnr_db``: luma PSNR of the mean squared error. ``delay_ms``: from a picture to its
     reconstruction, for a ``share`` of the frames; None: only the mean rate is asked about.
@@ -71,33 +71,33 @@ class Demand:
             raise InvalidInput("share", f"{self.share:g} is outside 0.5..1 (1 itself excluded)")
 
     @property
-    def wanted(self) -> Wanted:
-        """One of the cameras."""
-        return Wanted(self.width_px, self.height_px, self.hz, self.psnr_db)
+    def wanted(self) -> CameraDemand:
+        """The demand of one camera."""
+        return CameraDemand(self.width_px, self.height_px, self.hz, self.psnr_db)
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """What the tables do not say: the transport, the cell and the city."""
+    """Assumptions about the transport, the cell and the distance between sites."""
 
     overhead_percent: float = 4.0
-    """Bytes of transport over those of frames. RTP, UDP and IPv4 headers of 40 bytes (RFC 3550,
-    768, 791) on packets of 1000 to 1200 bytes are 3.3 to 4 %."""
+    """Bytes of transport headers over those of frames: 40 bytes of RTP, UDP and IPv4 on packets of
+    1000 to 1200 bytes are 3.3 to 4 %."""
     propagation_ms: float = 20.0
-    """One way from the vehicle to the server, empty link; the link of `rfedge demo` has as much."""
+    """One-way delay from the vehicle to the server on an empty link, ms."""
     bandwidth_mhz: float = 100.0
-    """Of the cell's carrier; the widest of 3GPP TS 38.101-1 in band n78."""
+    """Bandwidth of the cell; 100 MHz is the widest of 3GPP TS 38.101-1 in band n78."""
     uplink_share: Annotated[float, arg(name="uplink-share")] = 0.23
-    """Of the carrier's time: DDDSU, one slot of five up and some of the special one."""
+    """Share of the time for uplink; 0.23 is the slot pattern DDDSU."""
     bits_per_hz: float = 5.4
-    """Average uplink spectral efficiency in bit/s/Hz of a cell: what ITU-R M.2410 requires in
-    dense urban areas; 1.6 in rural ones."""
+    """Average uplink spectral efficiency of a cell, bit/s/Hz; ITU-R M.2410 requires 5.4 in dense
+    urban and 1.6 in rural areas."""
     utilisation: float = 0.7
-    """Share of a cell's capacity that may be planned with."""
+    """Share of a cell's capacity to plan with."""
     inter_site_m: float = 200.0
-    """Distance between sites: dense urban of ITU-R M.2412; 1732 in its rural areas."""
+    """Distance between sites, m; ITU-R M.2412 has 200 for dense urban and 1732 for rural areas."""
     sectors: int = 3
-    """Cells of a site."""
+    """Number of cells of a site."""
 
     def __post_init__(self) -> None:
         for name in ("bandwidth_mhz", "bits_per_hz", "inter_site_m", "sectors"):
@@ -112,18 +112,18 @@ class Assumptions:
 
     @property
     def cell_mbps(self) -> float:
-        """What a cell's uplink may be planned to carry."""
+        """Throughput of a cell's uplink that may be planned with, Mbit/s."""
         return self.bandwidth_mhz * self.uplink_share * self.bits_per_hz * self.utilisation
 
     @property
     def cells_per_km2(self) -> float:
-        """Of a hexagonal grid."""
+        """Density of cells on a hexagonal grid of sites."""
         return self.sectors / (HEXAGON * (self.inter_site_m / 1e3) ** 2)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One codec: rates in Mbit/s of a vehicle with transport, cores of either end for it.
+    """One codec's needs for a vehicle: Mbit/s with transport, and cores at either end.
 
     ``mbps`` is the mean rate, with the 95 % interval of the nearest cell; ``link_mbps`` the link
     that keeps the delay, None unless one is asked for and can be kept. A cell holds as many
@@ -143,7 +143,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Sizing:
-    """The estimates, ours first, and in words where they leave what was measured."""
+    """The estimates, ours first; ``beyond`` says where they go beyond the measurements."""
 
     demand: Demand
     assumptions: Assumptions
@@ -173,7 +173,7 @@ def estimate(
 
 
 def _left_ms(demand: Demand, cells: Sequence[SizingCell], assumptions: Assumptions) -> float | None:
-    """Return the time that is left for sending a frame, None where no delay is asked for.
+    """Return the time that is left for sending a frame, or None if no delay is asked for.
 
     A vehicle's cameras are computed in parallel.
     """
@@ -183,7 +183,7 @@ def _left_ms(demand: Demand, cells: Sequence[SizingCell], assumptions: Assumptio
 
 
 def _late(demand: Demand, left_ms: Mapping[str, float | None]) -> list[str]:
-    """Return in words who is late on any link; raise ``InvalidInput`` if it is everybody."""
+    """Return a note for each codec that is late on any link; raise ``InvalidInput`` if all are."""
     notes = [
         f"{codec}: no link keeps {demand.delay_ms:g} ms: coding, decoding and propagation alone "
         f"take {demand.delay_ms - left:.0f} ms on one thread of the machine that was measured"
@@ -196,7 +196,7 @@ def _late(demand: Demand, left_ms: Mapping[str, float | None]) -> list[str]:
 
 
 def _notes(reach: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return each note once, with the codecs it is about unless it is about all of them."""
+    """Return each note once, with its codecs unless it concerns all of them."""
     about: dict[str, list[str]] = {}
     for codec, notes in reach.items():
         for note in notes:
@@ -207,7 +207,7 @@ def _notes(reach: Mapping[str, Sequence[str]]) -> list[str]:
     ]
 
 
-def _times_ms(wanted: Wanted, cells: Sequence[SizingCell]) -> tuple[float, float]:
+def _times_ms(wanted: CameraDemand, cells: Sequence[SizingCell]) -> tuple[float, float]:
     """Return the processor time of sender and receiver for a frame."""
     sender_ms = math.exp(log_at(cells, wanted, lambda cell: math.log(cell.sender_ms)))
     receiver_ms = math.exp(log_at(cells, wanted, lambda cell: math.log(cell.receiver_ms)))
@@ -250,7 +250,7 @@ def _estimate(
     )
 
 
-def nearest_cell(cells: Sequence[SizingCell], wanted: Wanted) -> SizingCell:
+def nearest_cell(cells: Sequence[SizingCell], wanted: CameraDemand) -> SizingCell:
     """Return the measured cell whose rate and size differ least from ``wanted``, as ratios."""
 
     def distance(cell: SizingCell) -> float:
@@ -262,7 +262,7 @@ def nearest_cell(cells: Sequence[SizingCell], wanted: Wanted) -> SizingCell:
 def share_in_time(
     frame_bytes: Sequence[float], cameras: int, hz: float, rate_bps: float, within_s: float
 ) -> float:
-    """Return the share of frames that leave a link of ``rate_bps`` ``within_s`` of their start."""
+    """Return the share of frames that leave a link of ``rate_bps`` within ``within_s``."""
     free_s, in_time = 0.0, 0
     for instant, size_bytes in enumerate(islice(cycle(frame_bytes), INSTANTS)):
         start_s = instant / hz

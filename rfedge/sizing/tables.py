@@ -1,11 +1,11 @@
-"""What was measured for sizing an uplink: a cell for each codec, size of picture and rate.
+"""The tables for sizing an uplink: one measured cell for each codec, picture size and rate.
 
 A cell's curve is bytes a frame over luma PSNR on a grid of half decibels, without the first frame,
 with the 95 % interval that resampling the frames gives. Between cells and grid points logarithms
 are interpolated. The tables that ship are the result file ``tables.json`` beside this module, made
 by ``rfedge-lab size-tables``.
 
-``log_at`` tells bytes and times at any size, rate and quality, between and a little beyond the
+``log_at`` estimates bytes and times at any size, rate and quality, between and a little beyond the
 measured cells. Logarithms are interpolated linearly: over decibels within a cell, over log(Hz)
 between cells of one size, over log(pixels) between sizes. At a size that was measured at fewer
 rates than another, the effect of the rate beyond them is taken from the size with the widest range.
@@ -28,9 +28,9 @@ from rfedge.results import read_result, rows_of
 __all__ = [
     "CODECS",
     "SHIPPED",
+    "CameraDemand",
     "SizingCell",
     "SizingTables",
-    "Wanted",
     "check_reach",
     "log_at",
     "read_tables",
@@ -43,7 +43,7 @@ MARGIN = 1e-6
 KIND = "sizing"
 SHIPPED = Path(__file__).with_name("tables.json")
 CODECS = ("rfedge", "x264", "x265", "svtav1")
-"""Ours at the default effort; rivals for low delay, tuned for PSNR where they can be."""
+"""Ours at the default effort; rivals at low delay, tuned for PSNR where that is possible."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,17 @@ class SizingCell:
 
     @property
     def pixels(self) -> int:
-        """Of one picture."""
+        """Number of pixels of one picture."""
         return self.width_px * self.height_px
 
     def log_bytes(self, psnr_db: float, column: str = "bytes_per_frame") -> float:
-        """Return the logarithm of a column at a quality, beyond the grid by its last slope."""
+        """Return the logarithm of a column at a quality, extrapolated by the last slope."""
         return interpolated(self.psnr_db, [math.log(n) for n in getattr(self, column)], psnr_db)
 
 
 @dataclass(frozen=True)
 class SizingTables:
-    """All cells, and in words what they were measured on."""
+    """All cells, and the drives that they were measured on, in words."""
 
     cells: tuple[SizingCell, ...]
     measured_on: str
@@ -94,7 +94,7 @@ class SizingTables:
 
     @property
     def codecs(self) -> tuple[str, ...]:
-        """The codecs there are, in the order of ``CODECS``."""
+        """The codecs of the cells, in the order of ``CODECS``."""
         there = {cell.codec for cell in self.cells}
         return tuple(codec for codec in CODECS if codec in there)
 
@@ -120,11 +120,11 @@ def interpolated(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
 
 
 Value = Callable[[SizingCell], float]
-"""A logarithm taken of a cell."""
+"""Returns a logarithm of one of a cell's values."""
 
 
 @dataclass(frozen=True)
-class Wanted:
+class CameraDemand:
     """The camera asked about: a size in pixels, pictures a second, and luma PSNR."""
 
     width_px: int
@@ -134,11 +134,11 @@ class Wanted:
 
     @property
     def pixels(self) -> int:
-        """Of one picture."""
+        """Number of pixels of one picture."""
         return self.width_px * self.height_px
 
 
-def log_at(cells: Sequence[SizingCell], wanted: Wanted, value: Value) -> float:
+def log_at(cells: Sequence[SizingCell], wanted: CameraDemand, value: Value) -> float:
     """Return ``value`` of one codec's cells at the wanted size and rate."""
     rows: dict[int, dict[float, float]] = {}
     for cell in cells:
@@ -161,10 +161,10 @@ def _over_rate(row: dict[float, float], hz: float) -> float:
     return interpolated(logs, [row[rate] for rate in rates], math.log(hz))
 
 
-def check_reach(cells: Sequence[SizingCell], wanted: Wanted) -> tuple[str, ...]:
-    """Return in words what about ``wanted`` lies outside the cells of one codec.
+def check_reach(cells: Sequence[SizingCell], wanted: CameraDemand) -> tuple[str, ...]:
+    """Return a note for each value of ``wanted`` that lies outside the cells of one codec.
 
-    Raises ``InvalidInput`` naming the value and the range for what lies too far outside.
+    Raises ``InvalidInput`` naming the value and the range if it lies too far outside.
     """
     pixels = [cell.pixels for cell in cells]
     rates = [cell.hz for cell in cells]
@@ -193,11 +193,12 @@ def _beyond(
     if _within(value, measured):
         return None
     if not _within(value, (low / factor, high * factor)):
-        allowed = "nothing else" if factor == 1 else f"at most {factor:g} times beyond"
+        reach = "no further" if factor == 1 else f"at most {factor:g} times beyond"
         raise InvalidInput(
-            name, f"{shown} is outside the measured {low:,g}..{high:,g}, of which {allowed} can be "
-            "told; measure your own with --drive and --field"
-        )  # fmt: skip
+            name,
+            f"{shown} is outside the measured {low:,g}..{high:,g}, and estimates go {reach}; "
+            "measure your own with --drive and --field",
+        )
     return f"{shown} is {max(low / value, value / high):.2f} times outside {low:,g}..{high:,g}"
 
 

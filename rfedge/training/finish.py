@@ -1,21 +1,17 @@
-"""From a trained field to the one that is written, and the run as one JSON object.
+"""Finish a trained field: choose its size, fit levels of detail, compress it and measure it.
 
-Written fields have lower levels of detail, are compressed, and state the held-out quality of the
-field as it will be read, not as it was trained. The JSON has quality, time, size and how to repeat
-the run.
+The header of a finished field states the held-out quality of the compressed field.
 
-How large a field should be depends on how often it is driven through: ``FieldSizer`` takes one of
-``SIZES``, either the first that fits into so many bytes, or the one that takes the fewest bytes of
-field and stream over so many passes, with the stream coded as a vehicle codes it.
+How large a field should be depends on how often vehicles drive through it. ``FieldSizer`` takes one
+of ``SIZES``: either the first that fits into a number of bytes, or the one with the fewest bytes of
+field and stream over a number of passes. For the latter it codes the stream as a vehicle does.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -39,9 +35,6 @@ from rfcore.train.levels import LevelFitConfig, fitted, with_levels
 from rfcore.update.passes import SeenFrame, spread
 from rfcore.update.trial import Trial, saved_percent, try_field
 from rfcore.views import PosedPicture
-from rfedge.results import make_result, provenance
-from rfedge.training.refined_poses import PoseRefinement
-from rfedge.training.run import Trained, TrainingJob
 
 __all__ = [
     "SIZES",
@@ -51,20 +44,19 @@ __all__ = [
     "finish_field",
     "fit_levels",
     "size_goal",
-    "training_result",
 ]
 
 MOST_CAMERAS = 60
-"""Cameras that say from where a splat is seen, evenly spread."""
+"""Number of cameras, evenly spread, from which the visible directions of splats are taken."""
 TRIAL_FRAMES = 8
 """Consecutive frames that are coded against every size."""
 LEVELS_SHARE = 1.15
-"""What fitted levels add to the bytes of a field, at most: 1.12 on the first sample."""
+"""Upper bound of what fitted levels multiply a field's bytes by; 1.12 on the first sample."""
 
 
 @dataclass(frozen=True)
 class FieldSize:
-    """A size a field can be written in: ``share`` of its splats, on coarser grids.
+    """A size that a field can have: a share of its splats, on coarser grids.
 
     ``price`` as in ``frugal_colours``; ``steps`` and ``grain`` as in ``compressed_archive``.
     """
@@ -90,16 +82,15 @@ SIZES = (
     FieldSize(0.3, 0.1, COARSE, Grain(1, 4)),
     FieldSize(0.2, 0.1, COARSE, Grain(1, 4)),
 )
-"""From the largest to the smallest, each 0.75 to 0.9 of the bytes of the one before. The second and
-third are measured on the sample field (docs/how-to/fields.md); those with fewer splats are not
-yet."""
+"""Sizes from the largest to the smallest, each 0.75 to 0.9 of the bytes of the one before. The
+first three are measured on the sample field; those with fewer splats are not."""
 
 
 @dataclass(frozen=True)
 class SizeGoal:
-    """How large a field may be (``max_bytes``), and how often it is driven through (``passes``).
+    """The largest number of bytes, and the number of passes over which bytes are counted.
 
-    Without either, the largest of ``SIZES``. Raises ``InvalidInput`` for less than 1.
+    Without either, the largest of ``SIZES`` is taken. Raises ``InvalidInput`` for less than 1.
     """
 
     max_bytes: int | None = None
@@ -118,10 +109,10 @@ def size_goal(max_mb: float | None, passes: int | None) -> SizeGoal:
 
 
 class FieldSizer:
-    """Writes a field in the size a goal asks for.
+    """Brings a field to the size that a goal asks for.
 
-    ``views``: where splats are seen from; their pixels are not read. ``drive``: pictures in the
-    order of a pass, which are coded to choose a size for ``SizeGoal.passes``.
+    ``views`` say from where splats are seen; their pixels are not read. ``drive`` has the pictures
+    of a pass in their order; they are coded to choose a size for ``SizeGoal.passes``.
     """
 
     def __init__(
@@ -156,7 +147,7 @@ class FieldSizer:
         )
 
     def _may_fit(self, field: SplatField, size: FieldSize, goal: SizeGoal) -> bool:
-        """Whether a size may have few enough bytes: measured without fitting anything."""
+        """Return whether a size may be small enough, measured without fitting anything."""
         if goal.max_bytes is None:
             return True
         unfitted = self._frugal(self._pruned(field, size, fit=False), size)
@@ -187,23 +178,23 @@ class FieldSizer:
     def _pruned(self, field: SplatField, size: FieldSize, *, fit: bool = True) -> SplatField:
         """Return the splats that contribute most, fitted to the renders of all if ``fit``.
 
-        Without levels, which are fitted to what is kept.
+        The field has no levels yet; they are fitted to the splats that are kept.
         """
         keep = math.ceil(size.share * field.primitives)
         if keep == field.primitives:
-            return _of(field, field.gaussians, {})
+            return _with_splats(field, field.gaussians, {})
         full, config = field.rasterizer(), self._config
         weights = contributions(
             field.gaussians, self._cameras, threads=config.threads, antialiased=full.antialiased
         )
         kept = reordered(field.gaussians, most_important_first(weights)[:keep])
-        return _of(field, fitted(kept, full, self._cameras, config) if fit else kept, {})
+        return _with_splats(field, fitted(kept, full, self._cameras, config) if fit else kept, {})
 
     def _with_levels(self, field: SplatField) -> SplatField:
         return fit_levels(field, self._cameras, self._config, self._console)
 
     def _frugal(self, field: SplatField, size: FieldSize) -> SplatField:
-        """Return the compressed field, its colours frugal where they are not seen."""
+        """Return the compressed field, with colours simplified in directions nobody sees."""
         seen = seen_directions(
             field.gaussians,
             self._seen_from,
@@ -211,11 +202,11 @@ class FieldSizer:
             antialiased=field.metadata.antialiased,
         )
         colours = frugal_colours(field.gaussians, seen, size.steps, size.price)
-        return _of(field, colours, field.levels).compressed(size.steps, size.grain)
+        return _with_splats(field, colours, field.levels).compressed(size.steps, size.grain)
 
 
-def _of(field: SplatField, gaussians: Gaussians, levels: LevelsOfDetail) -> SplatField:
-    """Return the field with other splats and levels, not measured."""
+def _with_splats(field: SplatField, gaussians: Gaussians, levels: LevelsOfDetail) -> SplatField:
+    """Return the field with other splats and levels, and without its measured quality."""
     metadata = replace(field.metadata, held_out_psnr_db=None, held_out_ssim=None)
     return SplatField(gaussians, metadata, levels=levels, threads=field.threads, isa=field.isa)
 
@@ -247,8 +238,8 @@ def finish_field(
 ) -> SplatField:
     """Return the field with levels fitted to ``views``' cameras, compressed and measured.
 
-    ``goal`` says how large it may be, over passes like ``held_out``, or ``views`` without any.
-    ``held_out`` may be empty: then the header states no quality.
+    ``goal`` says how large the field may be. Passes are like ``held_out``, or like ``views`` if
+    that is empty; then the header states no quality.
     """
     sizer = FieldSizer(views, held_out or views, config, console)
     small = sizer.sized(field, goal if goal is not None else SizeGoal())
@@ -277,45 +268,3 @@ def fit_levels(
             bar.update(task, completed=done, total=total)
 
         return with_levels(field, cameras, config, show)
-
-
-def _refinement(refinement: PoseRefinement | None) -> dict[str, float] | None:
-    """Return how far poses were moved, for the result."""
-    if refinement is None:
-        return None
-    names = ("median_m", "p95_m", "median_deg", "p95_deg")
-    return {name: getattr(refinement, name) for name in names}
-
-
-def training_result(
-    job: TrainingJob, trained: Trained, written: RadianceField, archive: Path
-) -> dict[str, Any]:
-    """Return the result of a run whose field was written to ``archive``.
-
-    ``held_out`` is the quality of the field as written; the curve ends with that as trained.
-    """
-    k = job.dataset.pictures[0].camera.intrinsics
-    metadata = written.metadata
-    content = {
-        "field": f"{metadata.kind} {written.field_id}",
-        "views": len(job.dataset.pictures),
-        "held_out": {
-            "psnr_db": metadata.held_out_psnr_db,
-            "ssim": metadata.held_out_ssim,
-            "views": len(job.held_out.pictures) if job.held_out is not None else 0,
-        },
-        "as_trained": asdict(trained.quality) if trained.quality is not None else None,
-        "held_out_aligned": asdict(trained.aligned) if trained.aligned is not None else None,
-        "pose_refinement": _refinement(trained.refinement),
-        "seconds": trained.seconds,
-        "iterations": trained.iterations,
-        "primitives": trained.primitives,
-        "bytes": archive.stat().st_size,
-        "curve": [list(point) for point in trained.curve],
-        "width": k.width_px,
-        "height": k.height_px,
-        "seed": job.seed,
-        "settings": asdict(job.config),
-        "training_digest": metadata.training_digest,
-    }
-    return make_result("training", provenance(), content)

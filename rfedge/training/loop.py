@@ -1,8 +1,8 @@
 """The loop around a trainer: time, measurements, checkpoints, progress on the console.
 
-Any ``FieldTrainer`` will do. Seconds are those of training: neither the time measuring takes nor
-that of reading the pictures counts, and a resumed run goes on counting where it stopped. Progress
-is a bar on a terminal and a line at each twentieth of the run in a log.
+The loop takes any ``FieldTrainer``. It counts seconds of training, without the time for measuring
+and for reading pictures; a resumed run goes on counting where it stopped. Progress is a bar on a
+terminal, and a line at each twentieth of the run in a log.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAX_MINUTES = 7 * 24 * 60.0
 
 @dataclass(frozen=True)
 class LoopLimits:
-    """When a run ends, and what it leaves behind on the way."""
+    """When a run ends, and how often it writes a checkpoint and measures."""
 
     minutes: float | None = None
     """End after so many minutes of training instead of at the trainer's iterations."""
@@ -38,7 +38,7 @@ class LoopLimits:
     checkpoint_every: int = 1000
     """Iterations between two checkpoints."""
     measurements: int = 12
-    """Points of the curve of quality over time; 0: none is measured."""
+    """Number of points of the curve of quality over time; 0: none is measured."""
 
     def __post_init__(self) -> None:
         if self.minutes is not None and not 0 < self.minutes <= MAX_MINUTES:
@@ -63,8 +63,8 @@ class LoopStatus:
 class TrainingLoop:
     """Runs a trainer to its end. ``clock`` returns seconds that never go back.
 
-    ``show`` is given the trainer after each iteration (``rfedge.training.view``); what it takes is
-    no time of training.
+    ``show`` is called with the trainer after each iteration (``rfedge.training.view``); its time
+    does not count as training.
     """
 
     def __init__(
@@ -90,13 +90,13 @@ class TrainingLoop:
 
     @property
     def progress(self) -> float:
-        """How far the run is, 0..1."""
+        """The share of the run that is done, 0..1."""
         if self._limits.minutes is None:
             return self.trainer.iteration / self.trainer.total
         return min(self.seconds / (60 * self._limits.minutes), 1.0)
 
     def resume(self) -> None:
-        """Go on after the checkpoint. Raises ``InvalidInput`` when it is of another run."""
+        """Go on after the checkpoint; raise ``InvalidInput`` if it belongs to another run."""
         if self._limits.checkpoint is None:
             raise InvalidInput("resume", "needs a checkpoint to go on from")
         checkpoint = read_checkpoint(self._limits.checkpoint)
@@ -107,7 +107,7 @@ class TrainingLoop:
         self._started_s, self._aside_s = self._clock(), 0.0
 
     def run(self, tell: Callable[[LoopStatus], None]) -> None:
-        """Train to the end, telling where it is after every iteration.
+        """Train to the end; call ``tell`` with the status after every iteration.
 
         Raises ``TrainingDiverged``; the last good checkpoint stays.
         """
@@ -136,7 +136,7 @@ class TrainingLoop:
         self.curve.append((at_s, self._aside(lambda: measure(self.trainer.field()))))
 
     def _aside(self, work: Callable[[], Result]) -> Result:
-        """Do what is no training; its time does not count."""
+        """Do work that is not training, and leave its time out."""
         before_s = self._clock()
         done = work()
         self._aside_s += self._clock() - before_s
@@ -149,7 +149,7 @@ class TrainingLoop:
 
 
 STEPS = 1000
-"""Of the bar: progress is a share, of time or of iterations."""
+"""Steps of the progress bar; progress is a share of time or of iterations."""
 LINES = 20
 
 
@@ -182,7 +182,7 @@ def _with_bar(loop: TrainingLoop, console: Console) -> None:
 
 
 class _Lines:
-    """Prints a line at each twentieth; time left goes by the pace since the start."""
+    """Prints a line at each twentieth; the time left follows from the pace since the start."""
 
     def __init__(self, console: Console, now_s: Callable[[], float]) -> None:
         self._console, self._now_s = console, now_s

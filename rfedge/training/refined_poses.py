@@ -1,9 +1,9 @@
-"""What a run did to its pictures' poses, and what held-out pictures show at poses of their own.
+"""Poses that a run refined: how far they moved, their file, and held-out quality at aligned poses.
 
-Held-out pictures have the same wrong poses as the others. Measured at these, a field looks as bad
-as they are; aligned with the field one by one, as a vehicle that finds its pose in the field does,
-they show how good the field is. The pictures' own pixels are used for that: both figures are
-stated, and two fields are compared with both aligned.
+Held-out pictures have wrong poses like the others, and measured at these every field looks bad.
+Aligned with the field one by one, as a vehicle does that finds its pose in the field, they show how
+good the field is. Since that uses the pictures' own pixels, both figures are reported, and fields
+are compared with both aligned.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["PoseRefinement", "aligned_quality", "refinement_of", "write_refined_
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """How far the pictures' poses were moved, and their cameras as they are now."""
+    """How far the pictures' poses moved, and the refined cameras."""
 
     median_m: float
     p95_m: float
@@ -37,7 +37,7 @@ class PoseRefinement:
 
 
 def refinement_of(trainer: FieldTrainer) -> PoseRefinement | None:
-    """Return what became of the poses, None where they were held."""
+    """Return the refinement of the poses, or None if they were held fixed."""
     if not isinstance(trainer, SplatTrainer):
         return None
     corrections: Sequence[PoseCorrection] = trainer.pose_corrections()
@@ -57,7 +57,7 @@ def refinement_of(trainer: FieldTrainer) -> PoseRefinement | None:
 def aligned_quality(
     trainer: FieldTrainer, field: RadianceField, pictures: Sequence[PosedPicture], threads: int
 ) -> HeldOut | None:
-    """Return the quality of held-out pictures at poses aligned with the field; None of a grid."""
+    """Return the quality at poses aligned with the field, or None for a hash grid."""
     if not (isinstance(trainer, SplatTrainer) and isinstance(field, SplatField)):
         return None
     aligned = align_pictures(field, pictures, trainer.depth_m, threads)
@@ -67,9 +67,9 @@ def aligned_quality(
 def write_refined_poses(
     out: Path, pictures: Sequence[PosedPicture], cameras: Sequence[Camera], origin: TileOrigin
 ) -> None:
-    """Write the refined poses as TUM lines in the dataset's world, a picture's name before each.
+    """Write the refined poses as TUM lines in the dataset's world, each after its picture's name.
 
-    Time is the picture's in seconds; in a dataset without times its number.
+    The time of a line is the picture's in seconds, or its number in a dataset without times.
     """
     times_ns = [picture.time_ns for picture in pictures]
     timed = len(times_ns) > 1 and all(a < b for a, b in pairwise(times_ns))

@@ -1,12 +1,9 @@
-"""The page of one training run, and the section of the results page about all of them.
-
-The page shows held-out pictures beside their renders and the curve of quality over time.
-"""
+"""The page of one training run: held-out pictures beside their renders, and quality over time."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +17,8 @@ from rfcore.image import Rgb, rgb_from_colour
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 from rfedge.report.charts import DIFFERENCE_GAIN, amplified_difference, curve_chart, embedded
-from rfedge.report.tables import table
-from rfedge.results import Result, read_result
 
-__all__ = ["training_section", "write_training_report"]
+__all__ = ["write_training_report"]
 
 
 def write_training_report(
@@ -31,8 +26,8 @@ def write_training_report(
 ) -> None:
     """Write the page of one run.
 
-    ``result`` is the content of its JSON; ``held_out`` the pictures it was measured on, of which
-    the best, the median and the worst are shown.
+    ``result`` is the content of its JSON. Of ``held_out``, the pictures that it was measured on,
+    the page shows the best, the median and the worst.
     """
     environment = Environment(
         loader=PackageLoader("rfedge.training", "."), autoescape=True, undefined=StrictUndefined
@@ -83,42 +78,3 @@ def _strip(which: str, picture: PosedPicture, render: Rgb, quality_db: float) ->
         "which": which,
         "pictures": embedded(captions),
     }
-
-
-RUN_COLUMNS = (
-    "run",
-    "views",
-    "size",
-    "held out dB",
-    "SSIM",
-    "seconds",
-    "iterations",
-    "primitives",
-    "MB",
-)
-
-
-def training_section(paths: Sequence[Path]) -> str:
-    """Return a table of training runs, and the command of each."""
-    runs = {path.stem: read_result(path, "training") for path in paths}
-    rows = [_run_cells(name, run) for name, run in runs.items()]
-    commands = [
-        f"* {name}: `{run['command']}` at `{run['revision']}`" for name, run in runs.items()
-    ]
-    return "\n\n".join(["## training", table(RUN_COLUMNS, rows), "\n".join(commands), ""])
-
-
-def _run_cells(name: str, run: Result) -> list[str]:
-    held_out = run["held_out"]
-    psnr_db, ssim = held_out["psnr_db"], held_out["ssim"]
-    return [
-        name,
-        str(run["views"]),
-        f"{run['width']}x{run['height']}",
-        "-" if psnr_db is None else f"{psnr_db:.2f}",
-        "-" if ssim is None else f"{ssim:.3f}",
-        f"{run['seconds']:.0f}",
-        str(run["iterations"]),
-        str(run["primitives"]),
-        f"{run['bytes'] / 1e6:.1f}",
-    ]

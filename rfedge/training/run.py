@@ -1,17 +1,18 @@
 """Train a field with progress on the console, and measure it on pictures it never saw.
 
-How much memory a run takes is printed before it starts: the sum of what is allocated, for the
-largest set the run may grow to. The one run that tests/train/test_training_memory.py measures stays
-within 15 % of the estimate.
+The estimate of memory that is printed before a run starts is the sum of all allocations for the
+largest set of primitives that the run may grow to. tests/train/test_training_memory.py compares it
+with a run: it is within 15 %.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from time import monotonic
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -34,6 +35,7 @@ from rfcore.train import (
 )
 from rfcore.train.start import random_points
 from rfcore.views import PosedPicture
+from rfedge.results import make_result, provenance
 from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing
 from rfedge.training.refined_poses import PoseRefinement, aligned_quality, refinement_of
 
@@ -49,13 +51,14 @@ __all__ = [
     "train",
     "train_field",
     "training_config",
+    "training_result",
 ]
 
 BASE_BYTES = 350 << 20
-"""The interpreter, numpy, PyAV, the report's libraries and what finding neighbours takes."""
+"""Memory of the interpreter, numpy, PyAV, the report's libraries and the neighbour search."""
 FLOATS_OF_GEOMETRY = 11
 SETS = 3
-"""Parameters and two moments."""
+"""Number of copies of the parameters: themselves and two moments."""
 SLACK = 1.25
 """Buffers that grow are allocated a quarter larger than asked for."""
 SPLAT_BYTES = 64 + 3 * 16 + 2 * 4 + 8
@@ -64,13 +67,13 @@ ENTRIES_PER_GAUSSIAN = 5
 """Overlaps with tiles of 16x16 pixels; 3 to 4 on the street at 640x360."""
 ENTRY_BYTES = 64 + 3 * 4
 NGP_CELL_BYTES = 5
-"""Of the occupancy grid: a float and a bit, twice while it is built anew."""
+"""Bytes of a cell of the occupancy grid: a float and a bit, twice while it is rebuilt."""
 NGP_SCRATCH_BYTES = 150 << 20
 """Samples and activations of one batch."""
 TWO_SIZES = 1.25
-"""Pixels of a picture and of the same halved."""
+"""Pixels of a picture and of its halved copy, over those of the picture."""
 PICTURE_FLOATS = 9
-"""Colour, target, gradient: three channels each."""
+"""Floats of a pixel: colour, target and gradient, three channels each."""
 
 
 def splat_training_bytes(gaussians: int, sh_degree: int, sizes_px: list[tuple[int, int]]) -> int:
@@ -94,7 +97,7 @@ def ngp_training_bytes(model: NgpModel, sizes_px: list[tuple[int, int]]) -> int:
 
 
 def available_bytes(meminfo: Path = Path("/proc/meminfo")) -> int | None:
-    """Return the memory that can be had without swapping; None where the system does not say."""
+    """Return the memory available without swapping, or None if the system does not say."""
     try:
         lines = meminfo.read_text().splitlines()
     except OSError:
@@ -114,18 +117,18 @@ def check_memory(needed: int, available: int | None) -> None:
 
 
 UNLIMITED_ITERATIONS = 1_000_000
-"""Of a run that ends by the clock."""
+"""Iterations of a run that ends by the clock."""
 
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """What to train on, how, and what to measure on (``held_out`` may be None)."""
+    """The pictures to train on and to measure on (``held_out`` may be None), and the settings."""
 
     name: str
     dataset: Dataset
     held_out: Dataset | None
     config: SplatTrainingConfig | NgpTrainingConfig
-    """Its class says which kind of field is trained."""
+    """The class of the settings says which kind of field is trained."""
     seed: int
     limits: LoopLimits = field(default_factory=partial(LoopLimits, measurements=0))
     resume: bool = False
@@ -135,7 +138,7 @@ class TrainingJob:
 
 @dataclass(frozen=True)
 class Trained:
-    """A field as it came out of training, and what that took."""
+    """A trained field, before it is finished, with the run's time and quality."""
 
     field: RadianceField
     quality: HeldOut | None
@@ -152,7 +155,7 @@ class Trained:
 def training_config(
     gaussians: int | None, iterations: int | None, threads: int
 ) -> SplatTrainingConfig:
-    """Return the trainer's own settings with what the user chose instead."""
+    """Return the trainer's default settings with the values that the user chose."""
     config = SplatTrainingConfig(threads=threads)
     if gaussians is not None:
         config = replace(config, gaussians=gaussians)
@@ -162,7 +165,7 @@ def training_config(
 
 
 def train_field(job: TrainingJob, console: Console) -> SplatField:
-    """Train splats as ``train`` does; return them alone."""
+    """Train splats as ``train`` does; return the field alone."""
     trained = train(job, console).field
     if not isinstance(trained, SplatField):
         raise InvalidInput("kind", f"{trained.metadata.kind} is not a field of splats")
@@ -172,9 +175,9 @@ def train_field(job: TrainingJob, console: Console) -> SplatField:
 def train(
     job: TrainingJob, console: Console, show: Callable[[FieldTrainer], None] | None = None
 ) -> Trained:
-    """Train to the end, showing progress, held-out PSNR and time left; ``show``: ``TrainingLoop``.
+    """Train to the end, showing progress, held-out PSNR and time left.
 
-    Says what memory it takes before it starts. Raises ``InvalidInput`` when that is not there, and
+    ``show`` is that of ``TrainingLoop``. Raises ``InvalidInput`` if there is too little memory, and
     ``TrainingDiverged`` when the run is lost; the last good checkpoint stays.
     """
     _announce(job, console)
@@ -218,7 +221,7 @@ def _trainer(job: TrainingJob) -> FieldTrainer:
 
 
 def needed_bytes(job: TrainingJob) -> int:
-    """Return an estimate of the memory that a job takes at most."""
+    """Return an estimate of the peak memory of a job."""
     config = job.config
     cameras = [picture.camera.intrinsics for picture in job.dataset.pictures]
     sizes = [(k.width_px, k.height_px) for k in cameras]
@@ -270,3 +273,42 @@ def _in_memory(pictures: Sequence[PosedPicture]) -> list[PosedPicture]:
 
 def _identity(rgb: Rgb) -> Rgb:
     return rgb
+
+
+REFINEMENT = ("median_m", "p95_m", "median_deg", "p95_deg")
+
+
+def training_result(
+    job: TrainingJob, trained: Trained, written: RadianceField, archive: Path
+) -> dict[str, Any]:
+    """Return the result of a run whose field was written to ``archive``: what it took and gave.
+
+    ``held_out`` is the quality of the field as written; the curve ends with that as trained.
+    """
+    k = job.dataset.pictures[0].camera.intrinsics
+    metadata, refinement = written.metadata, trained.refinement
+    content = {
+        "field": f"{metadata.kind} {written.field_id}",
+        "views": len(job.dataset.pictures),
+        "held_out": {
+            "psnr_db": metadata.held_out_psnr_db,
+            "ssim": metadata.held_out_ssim,
+            "views": len(job.held_out.pictures) if job.held_out is not None else 0,
+        },
+        "as_trained": asdict(trained.quality) if trained.quality is not None else None,
+        "held_out_aligned": asdict(trained.aligned) if trained.aligned is not None else None,
+        "pose_refinement": {name: getattr(refinement, name) for name in REFINEMENT}
+        if refinement is not None
+        else None,
+        "seconds": trained.seconds,
+        "iterations": trained.iterations,
+        "primitives": trained.primitives,
+        "bytes": archive.stat().st_size,
+        "curve": [list(point) for point in trained.curve],
+        "width": k.width_px,
+        "height": k.height_px,
+        "seed": job.seed,
+        "settings": asdict(job.config),
+        "training_digest": metadata.training_digest,
+    }
+    return make_result("training", provenance(), content)

@@ -1,8 +1,8 @@
-"""Which pictures a run trains on, which are held out, and which points it starts from.
+"""Choose the pictures to train on, those to hold out, and the points to start from.
 
-Points can come from depth maps beside a dataset's pictures: one file a picture, named as the
-picture with another suffix, ``.npy``, float32 [H, W] metres, or ``.png``, 16 bits, millimetres
-(nerfstudio's and Record3D's). 0 means unknown.
+Points can come from depth maps: one file for each picture, with the picture's name and the suffix
+``.npy`` (float32 [H, W], metres) or ``.png`` (16 bits, millimetres, as nerfstudio and Record3D
+write them). 0 means unknown.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 POINTS = 300_000
-"""About as many are made, twice what a run draws by default."""
+"""Approximate number of points to make: twice what a run draws by default."""
 MILLIMETRES = 1000.0
 
 
@@ -71,7 +71,7 @@ def read_depth_m(path: Path) -> NDArray[np.float32]:
 
 
 def _stored(path: Path) -> NDArray[Any]:
-    """Return the pixels as the file has them: [H, W], or [H, W, C] for more than one channel."""
+    """Return the file's pixels: [H, W], or [H, W, C] for more than one channel."""
     with av.open(str(path)) as container:
         return next(container.decode(video=0)).to_ndarray()
 
@@ -92,13 +92,13 @@ def _points_of(picture: PosedPicture, path: Path, count: int) -> PointCloud:
 
 @dataclass(frozen=True)
 class ViewChoice:
-    """What to read. ``held_out`` is another dataset, ``holdout`` every so many of this one."""
+    """Which pictures to read; ``held_out`` is another dataset, ``holdout`` is N of every Nth."""
 
     dataset: Path
     held_out: Path | None = None
     holdout: int | None = None
     percent: float = 100.0
-    """Of the pictures that are not held out."""
+    """Share of the pictures that are not held out."""
     points: Path | None = None
     """A .ply instead of the dataset's own points."""
     depths: Path | None = None
@@ -116,7 +116,7 @@ class ViewChoice:
 
 
 def read_views(choice: ViewChoice) -> tuple[Dataset, Dataset | None]:
-    """Return what to train on, and what to measure on, around the same origin."""
+    """Return the pictures to train on and those to measure on, around the same origin."""
     distortion = Distortion.UNDISTORT if choice.undistort else Distortion.REFUSE
     dataset = read_dataset(choice.dataset, distortion=distortion, size_px=choice.size_px)
     held_out = None
@@ -140,7 +140,7 @@ def read_views(choice: ViewChoice) -> tuple[Dataset, Dataset | None]:
 
 
 def split_every(dataset: Dataset, every: int) -> tuple[Dataset, Dataset]:
-    """Return the dataset without every ``every``-th picture, the first among them, and those.
+    """Return the dataset without every ``every``-th picture (from the first on), and those.
 
     The convention of mip-NeRF 360 and of 3DGS (``llffhold``).
     """

@@ -24,9 +24,9 @@ from rfedge.sizing.estimate import (
 from rfedge.sizing.tables import (
     CODECS,
     MAX_BEYOND_DB,
+    CameraDemand,
     SizingCell,
     SizingTables,
-    Wanted,
     check_reach,
     log_at,
     read_tables,
@@ -66,47 +66,47 @@ TABLES = SizingTables((*PARTLY, *(replace(c, codec="x264") for c in PARTLY)), "a
 def test_a_power_law_is_told_everywhere(
     cells: tuple[SizingCell, ...], width_px: int, hz: float, psnr_db: float
 ) -> None:
-    wanted = Wanted(width_px, width_px * 9 // 16, hz, psnr_db)
+    wanted = CameraDemand(width_px, width_px * 9 // 16, hz, psnr_db)
     told = log_at(cells, wanted, lambda c: c.log_bytes(psnr_db))
     assert told == pytest.approx(math.log(power_law_bytes(wanted.pixels, hz, psnr_db)), abs=1e-6)
 
 
 def test_inside_the_measured_ranges_nothing_is_said() -> None:
-    assert check_reach(WHOLE, Wanted(1280, 720, 15.0, 34.0)) == ()
+    assert check_reach(WHOLE, CameraDemand(1280, 720, 15.0, 34.0)) == ()
 
 
 @pytest.mark.parametrize(
     ("wanted", "said"),
     [
-        (Wanted(2560, 1440, 10.0, 34.0), "1.78 times outside"),
-        (Wanted(640, 360, 60.0, 34.0), "2.00 times outside"),
-        (Wanted(640, 360, 10.0, 38.5), "38.5 dB is 0.5 dB outside 30..38 dB"),
-        (Wanted(1920, 1080, 30.0, 34.0), "the effect of the rate is another size's"),
+        (CameraDemand(2560, 1440, 10.0, 34.0), "1.78 times outside"),
+        (CameraDemand(640, 360, 60.0, 34.0), "2.00 times outside"),
+        (CameraDemand(640, 360, 10.0, 38.5), "38.5 dB is 0.5 dB outside 30..38 dB"),
+        (CameraDemand(1920, 1080, 30.0, 34.0), "the effect of the rate is another size's"),
     ],
 )
-def test_what_lies_beyond_is_said(wanted: Wanted, said: str) -> None:
+def test_what_lies_beyond_is_said(wanted: CameraDemand, said: str) -> None:
     assert said in " ".join(check_reach(PARTLY, wanted))
 
 
 @pytest.mark.parametrize(
     ("wanted", "named"),
     [
-        (Wanted(3840, 2160, 10.0, 34.0), "size: 3840x2160"),
-        (Wanted(160, 90, 10.0, 34.0), "size: 160x90"),
-        (Wanted(640, 360, 61.0, 34.0), "hz: 61 Hz"),
-        (Wanted(640, 360, 10.0, 38.1 + MAX_BEYOND_DB), "db: 39.1 dB"),
+        (CameraDemand(3840, 2160, 10.0, 34.0), "size: 3840x2160"),
+        (CameraDemand(160, 90, 10.0, 34.0), "size: 160x90"),
+        (CameraDemand(640, 360, 61.0, 34.0), "hz: 61 Hz"),
+        (CameraDemand(640, 360, 10.0, 38.1 + MAX_BEYOND_DB), "db: 39.1 dB"),
     ],
 )
-def test_what_lies_too_far_beyond_is_refused(wanted: Wanted, named: str) -> None:
+def test_what_lies_too_far_beyond_is_refused(wanted: CameraDemand, named: str) -> None:
     with pytest.raises(InvalidInput, match=named):
         check_reach(PARTLY, wanted)
 
 
 def test_a_drive_of_ones_own_tells_its_own_size_and_rate_alone() -> None:
     own = (cell("rfedge", (640, 360), 10.0),)
-    assert check_reach(own, Wanted(640, 360, 10.0, 34.0)) == ()
-    for other in (Wanted(320, 180, 10.0, 34.0), Wanted(640, 360, 11.0, 34.0)):
-        with pytest.raises(InvalidInput, match="nothing else can be told"):
+    assert check_reach(own, CameraDemand(640, 360, 10.0, 34.0)) == ()
+    for other in (CameraDemand(320, 180, 10.0, 34.0), CameraDemand(640, 360, 11.0, 34.0)):
+        with pytest.raises(InvalidInput, match="estimates go no further"):
             check_reach(own, other)
 
 

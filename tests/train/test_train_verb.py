@@ -15,9 +15,8 @@ from rfcore.field import load_field, save_field
 from rfcore.train import NgpModel, NgpTrainingConfig
 from rfedge.cli.dataset import DatasetConvert
 from rfedge.cli.train import Train
-from rfedge.training.finish import training_result
 from rfedge.training.loop import LoopLimits
-from rfedge.training.run import TrainingJob, train
+from rfedge.training.run import TrainingJob, train, training_result
 from rfedge.training.views import (
     ViewChoice,
     read_depth_m,

@@ -88,7 +88,7 @@ def test_a_page_that_cannot_be_served_says_why() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         settings = WebSettings(Address("127.0.0.1", taken.getsockname()[1]))
         with (
-            pytest.raises(RfedgeError, match=r"cannot be served: .*in use"),
+            pytest.raises(RfedgeError, match=r"(?s)cannot be served: .*in use"),
             shown_in_browser(settings, None, lambda _: None),
         ):
             pytest.fail("the page was served on a port that is taken")
