@@ -1,4 +1,6 @@
-"""The procedural street: scene files, and the effects a scene declares."""
+"""Render declared streets into datasets.
+
+``load_scene`` reads a scene file; the command ``streetgen build`` renders it."""
 
 from streetgen.scene_file import Scene, load_scene
 

@@ -1,4 +1,4 @@
-"""``python -m streetgen``."""
+"""Run the command line by ``python -m streetgen``."""
 
 import sys
 

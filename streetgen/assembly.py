@@ -1,7 +1,7 @@
-"""Assemble a scene: its world (geometry, then the effects on the street) and its frame effects.
+"""Make the world of a scene, and apply the scene's effects to rendered frames.
 
-Each part of the street and each effect has its own random generator, so that leaving one out
-changes no other.
+Each part of the street and each effect has its own random generator. So leaving one out changes no
+other.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Class pictures: what each pixel of a rendered picture shows.
+"""Read class pictures, which say what each pixel of a rendered picture shows.
 
-``SPLIT/classes/N.png`` belongs to ``SPLIT/images/N.png``: 8 bit, one channel, of the same size; its
-levels are the numbers of ``Label``, each that of the surface behind the pixel's centre.
+``SPLIT/classes/N.png`` belongs to ``SPLIT/images/N.png`` and has its size. It is a PNG of one 8-bit
+channel; each level is the number of the ``Label`` of the surface behind the pixel's centre.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PICTURES, CLASSES = "images", "classes"
 
 
 class Label(IntEnum):
-    """What a pixel shows; the numbers are those of the class picture's levels."""
+    """The classes of surfaces; the numbers are the levels of a class picture."""
 
     SKY = 0
     ROAD = 1

@@ -25,8 +25,8 @@ __all__ = ["Build", "Plan", "Sheet", "main", "parse"]
 class Build:
     """Render a scene with Mitsuba 3 into a dataset.
 
-    The same command goes on where it was stopped. The same scene, size, samples and seed give the
-    same pictures, whatever the number of workers.
+    The same command goes on where a build was stopped. The same scene, size, samples and seed
+    give the same pictures, whatever the number of workers.
     """
 
     scene: Annotated[str, Positional, SCENE]
@@ -38,20 +38,20 @@ class Build:
     spp: int = 16
     """Samples a pixel, a square number."""
     renderer: Literal["auto", "cuda", "llvm", "scalar"] = "auto"
-    """Which variant of Mitsuba renders; auto: the first that works here of CUDA on an NVIDIA GPU,
-    LLVM and scalar. Pictures of two differ by rounding, so a folder is built by one."""
+    """The variant of Mitsuba that renders. `auto` takes the first that works here of CUDA on an
+    NVIDIA GPU, LLVM and scalar. Their pictures differ by rounding, so a folder is built by one."""
     workers: int = 1
-    """Processes. One uses all cores; more share them and take 1 to 2.5 GB each."""
+    """Number of processes. One uses all cores; several share them and take 1 to 2.5 GB each."""
     frames: Annotated[str | None, arg(metavar="A:B")] = None
     """Only frames a:b of the chosen splits, counted through drive, train, eval in that order."""
     split: Annotated[str, arg(metavar="SPLIT")] = "default"
-    """drive, train, eval, a list of them with commas, or all; default: all, but without train where
-    the scene's field was trained on another scene. rig: the drive by several cameras, with rig.toml
-    for `cav-agent --rig`."""
+    """drive, train, eval, a list of them with commas, or all. The default is all, but without train
+    where the scene's field was trained on another scene. rig takes the drive by several cameras and
+    writes rig.toml for `cav-agent --rig`."""
     rig: Annotated[str | None, arg(metavar="CAMERAS")] = None
-    """For --split rig: which cameras, with commas, of the car's 18 (low, mid or high with _front,
-    _front_left, _front_right, _left, _right, _back), or all; default: the mid row's front, left,
-    right and back."""
+    """For --split rig: a list, with commas, of the car's 18 cameras (low, mid or high with _front,
+    _front_left, _front_right, _left, _right, _back), or all. The default is the mid row's front,
+    left, right and back."""
 
     def run(self) -> None:
         """Build the dataset, or go on with it."""
@@ -109,7 +109,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Sheet:
-    """Write a contact sheet of built scenes; docs/scenes-contact-sheet.jpg is made with it."""
+    """Write a contact sheet of built scenes."""
 
     scenes: Annotated[tuple[Path, ...], Positional, arg(metavar="FOLDER ...")]
     """Folders that `streetgen build` made."""

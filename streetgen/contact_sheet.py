@@ -1,4 +1,4 @@
-"""A contact sheet: pictures of several built scenes on one page, a row of them for each scene."""
+"""Put pictures of several built scenes on one page, a row for each scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A rendered frame before it is a picture: linear light, depth, and how the camera moves."""
+"""Hold a rendered frame before it is a picture: linear light, depth, and the camera's motion."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class LinearFrame:
-    """``colour`` float32 [H, W, 3], linear, 1 is white; ``depth_m`` float32 [H, W], z, infinite in
-    the sky; ``labels`` uint8 [H, W], what each pixel shows (``geometry.mesh.Label``), where that is
-    known. ``velocity_mps`` and ``turn_radps`` are the camera's, in its own axes.
+    """A frame in linear light.
+
+    ``colour`` is float32 [H, W, 3], where 1 is white. ``depth_m`` is z, float32 [H, W], infinite in
+    the sky. ``labels`` uint8 [H, W] are the classes of the pixels (``classes.Label``), or None
+    where they are not known. ``velocity_mps`` and ``turn_radps`` are the camera's, in its own axes.
     """
 
     colour: F32

@@ -47,7 +47,7 @@ INDEX = re.compile(r"\[\d+\]$")
 
 @dataclass(frozen=True)
 class OneOf:
-    """One of these strings."""
+    """Permits only these strings."""
 
     choices: tuple[str, ...]
 
@@ -114,7 +114,7 @@ def _tuple(table: Table, key: str, kinds: tuple[Any, ...], within: Range) -> tup
 
 
 def _lines_of_keys(text: str) -> dict[str, int]:
-    """Where tables and keys begin; a key inside a multi-line string would be found too."""
+    """Return the lines where tables and keys begin; a multi-line string may add some."""
     found: dict[str, int] = {}
     table = ""
     for number, line in enumerate(text.splitlines(), start=1):
@@ -143,7 +143,7 @@ class RigSettings:
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Views a field is trained on."""
+    """The views that a field is trained on."""
 
     views: Annotated[int, Range(1, 100_000)] = 120
     size_px: Size = (640, 360)
@@ -151,7 +151,7 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """``stations`` of the whole rig, none of them a training pose."""
+    """Evaluation views by the whole rig at ``stations``, none of them a training pose."""
 
     stations: Annotated[int, Range(1, 1000)] = 8
     size_px: Size = (640, 360)
@@ -168,7 +168,7 @@ class DriveSettings:
     lane_offset_m: Annotated[float, LANE_OFFSET_M] = 0.0
     size_px: Size = (640, 360)
     rig: str = "mid_front,mid_left,mid_right,mid_back"
-    """Which of the car's cameras take the split ``rig`` (``rfcore.dataset.mounts``), or all."""
+    """The car's cameras that take the split ``rig`` (``rfcore.dataset.mounts``), or all."""
 
     @property
     def frames(self) -> int:
@@ -186,7 +186,7 @@ class DriveSettings:
 
 @dataclass(frozen=True)
 class LocalisationNoise:
-    """The measured pose, written beside the true one, differs by normal deviates."""
+    """Standard deviations of the measured pose, which is written beside the true one."""
 
     position_m: Annotated[float, Range(0, 5)] = 0.0
     rotation_deg: Annotated[float, Range(0, 10)] = 0.0

@@ -1,4 +1,4 @@
-"""The pictures a scene consists of: its splits as lists of posed shots, and selections of them.
+"""List the pictures that a scene consists of as posed shots, and select some of them.
 
 * ``drive``: the moving camera at the full rate; lower rates are every n-th frame of it.
 * ``train``: cars with the camera rig pass through the street, alternately in both directions; at
@@ -147,7 +147,7 @@ def _evaluation_poses(scene: Scene) -> list[Pose]:
 
 
 def _places(scene: Scene, count: int) -> list[float]:
-    """The middles of ``count`` equal stretches of the street."""
+    """Return the middles of ``count`` equal stretches of the street."""
     layout = Layout(scene.geometry)
     ends = np.linspace(layout.start_m + ENDS_M, layout.end_m - ENDS_M, count + 1)
     return ((ends[1:] + ends[:-1]) / 2).tolist()  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""How cars drive through the street, where their cameras are, and the pose that they measure.
+"""Compute the motion of cars, the poses of their cameras, and the poses that they measure.
 
 A car's axes are x forward, y left, z up, with the origin on the road. Traffic keeps right: cars
 driving towards +x are at y < 0. Camera axes are OpenCV's.
@@ -43,7 +43,7 @@ STEP_S = 1e-3
 
 @dataclass(frozen=True)
 class CameraMotion:
-    """How a camera moves, in its own axes."""
+    """A camera's velocity and turn rate, in its own axes."""
 
     velocity_mps: tuple[float, float, float]
     turn_radps: tuple[float, float, float]
@@ -108,7 +108,7 @@ def drive_motion(drive: DriveSettings, time_s: float) -> CameraMotion:
 
 
 def rig_motion(drive: DriveSettings, mount: Mount, time_s: float) -> CameraMotion:
-    """Return those of a camera on the car that takes the drive."""
+    """Return the velocity and turn rate of a camera on the car that takes the drive."""
     return _motion(partial(rig_pose, drive, mount), time_s)
 
 

@@ -1,1 +1,4 @@
-"""Building a scene's pictures on disk: in parallel, resumable, the same bytes for the same seed."""
+"""Build a scene's pictures on disk.
+
+A build runs in parallel and goes on where it was stopped. The same seed gives the same bytes.
+"""

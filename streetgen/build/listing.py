@@ -1,11 +1,12 @@
-"""The files that describe a built dataset: transforms, points, manifest, and its origin.
+"""Write the files that describe a built dataset: transforms, points, manifest, and its origin.
 
 ``transforms_SPLIT.json`` lists the finished shots of a split, ``transforms_drive_RATEhz.json``
-those that a lower rate keeps, ``..._measured.json`` the same pictures with measured poses where the
-scene declares localisation noise. The split ``rig`` is a dataset a camera of the instants that are
-finished, ``transforms_rig_CAMERA.json``, and ``rig.toml`` (``rfcore.dataset.rig``).
-``transforms.json`` is a copy of the training split's, or of the first split's without one.
-``build.json`` identifies the build, so that it continues only in its own folder.
+those that a lower rate keeps. ``..._measured.json`` lists the same pictures with measured poses,
+where the scene declares localisation noise. For the split ``rig`` each camera has a dataset
+``transforms_rig_CAMERA.json`` of the finished instants, and ``rig.toml`` describes the cameras
+(``rfcore.dataset.rig``). ``transforms.json`` is a copy of the training split's file, or of the
+first split's where there is no training split. ``build.json`` identifies the build, so that it
+continues only in its own folder.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Render one shot and write its files: picture, depth, classes and surface points.
 
 ``SPLIT/images/N.png`` is written last, so that an existing picture means a finished shot. Depth is
-z in millimetres, 16 bit, 0 for none or more than 65.535 m. Classes are the numbers of
-``streetgen.geometry.mesh.Label``. The 1000 points a shot are what a LiDAR at the camera would
+z in millimetres as 16-bit integers; 0 means none, or more than 65.535 m. Classes are the numbers of
+``streetgen.classes.Label``. The 1000 points of each shot are what a LiDAR at the camera would
 measure.
 """
 
@@ -47,7 +47,7 @@ PLACES = ("images", "depth", "classes", "points")
 
 @dataclass(frozen=True)
 class ShotFiles:
-    """Where a shot's files lie."""
+    """The paths of a shot's files."""
 
     folder: Path
     split: Split
@@ -60,12 +60,12 @@ class ShotFiles:
 
     @property
     def picture(self) -> Path:
-        """8-bit RGB."""
+        """The picture, 8-bit RGB."""
         return self._file("images", "png")
 
     @property
     def points(self) -> Path:
-        """Surface points."""
+        """The surface points that the shot shows."""
         return self._file("points", "ply")
 
     @property
@@ -147,7 +147,7 @@ def seen_points(
 
 @dataclass(frozen=True)
 class RenderJob:
-    """What is built where and how; everything a worker needs to know."""
+    """Everything that a worker needs to know to take shots of a scene."""
 
     scene: Scene
     folder: Path
@@ -158,7 +158,7 @@ class RenderJob:
 
 
 class SceneRenderer:
-    """A scene's world loaded into the renderer; a process holds one."""
+    """Takes shots of a scene, whose world it has loaded; a process holds one."""
 
     def __init__(self, job: RenderJob) -> None:
         self._job = job

@@ -1,10 +1,12 @@
-"""The effects a scene may declare: one module each, imported only when it is declared.
+"""Register the effects that a scene may declare, and import those that it does declare.
 
-They run in the order below. Those of the street change what is rendered (geometry, light and
-shade, surfaces), those of the air and of the sensor change rendered frames, which are linear, so
-that another exposure or another noise needs no new render. A module holds one frozen dataclass, its
-settings; that of an effect on the street has ``change(world, rng) -> world``, that of an effect on
-frames ``apply(frame, rng) -> frame``. A scene has one light.
+Effects run in the order below. Effects on the street change what is rendered: geometry, light and
+shade, surfaces. Effects of the air and the sensor change rendered frames. These are linear, so that
+another exposure or another noise needs no new render.
+
+Each effect is a module with one frozen dataclass, its settings. Settings of an effect on the street
+have ``change(world, rng) -> world``, those of an effect on frames ``apply(frame, rng) -> frame``. A
+scene has one light.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ __all__ = ["EFFECTS", "Effect", "EffectKind", "load_effect", "rng_of"]
 
 
 class EffectKind(StrEnum):
-    """What an effect changes."""
+    """The part of a scene or frame that an effect changes."""
 
     GEOMETRY = "geometry"
     LIGHT = "light"
@@ -33,7 +35,7 @@ class EffectKind(StrEnum):
 
 @dataclass(frozen=True)
 class Effect:
-    """An entry of the registry: the module is ``streetgen.effects.<name>``."""
+    """An entry of the registry; the module ``streetgen.effects.<name>`` has ``settings``."""
 
     name: str
     kind: EffectKind
@@ -42,7 +44,7 @@ class Effect:
 
     @property
     def on_frames(self) -> bool:
-        """Whether it changes rendered frames rather than the scene."""
+        """True if the effect changes rendered frames, false if it changes the scene."""
         return self.kind in (EffectKind.AIR, EffectKind.SENSOR)
 
 

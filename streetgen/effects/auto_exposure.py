@@ -1,8 +1,8 @@
-"""Automatic exposure that answers steps of the light late and overshoots (hunting).
+"""Change the exposure late after steps of the light, and overshoot (hunting).
 
-Each step is answered as an under-damped system does: after t seconds the gain has gone
-1 - exp(-t / settle_s) cos(2 pi t / period_s) of the way. When the steps come is declared, because a
-frame is made without those before it: a tunnel is two of them.
+The exposure answers a step as an under-damped system does: after t seconds the gain has covered the
+share 1 - exp(-t / settle_s) cos(2 pi t / period_s) of the step. The times of the steps are
+declared, because a frame is made without those before it. A tunnel is two steps.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["AutoExposure"]
 
 @dataclass(frozen=True)
 class AutoExposure:
-    """At each of ``at_s`` the exposure sets out to change by as many of ``steps``, in stops."""
+    """The steps of the exposure, in stops: ``steps[i]`` begins at the time ``at_s[i]``."""
 
     at_s: Annotated[tuple[float, ...], Range(0, 3600)] = (0.5, 1.5)
     steps: Annotated[tuple[float, ...], Range(-8, 8)] = (0.8, -0.8)

@@ -1,4 +1,4 @@
-"""Cyclists at the edges of both lanes: wheels roll and legs pedal as far as they have ridden."""
+"""Add cyclists at the edges of both lanes, whose wheels roll and legs pedal with the way ridden."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from streetgen.geometry.world import Mover, StreetPart, World
 __all__ = ["Cyclists"]
 
 BESIDE_M = 3.6
-"""From the middle of the road: between what drives in the lane and what is parked."""
+"""Distance from the middle of the road, between traffic in the lane and parked vehicles."""
 
 
 @dataclass(frozen=True)
 class Cyclists:
-    """Cyclists by their places at time 0, along x from the middle of the street.
+    """The cyclists' places at time 0, along x from the middle of the street.
 
     Those of ``along_m`` ride towards +x at the right edge of the road, those of ``oncoming_m``
     towards -x at its left edge. They do not brake, and re-enter the street after leaving it.
@@ -49,7 +49,7 @@ class Cyclists:
 
 
 def _pose(looks: Cyclist, course: Course, ahead_m: float, part: BodyPart, time_s: float) -> F64:
-    """``ahead_m``: how far wheels and crank have turned already at time 0."""
+    """Return world_from_part; ``ahead_m`` is how far wheels and crank have turned at time 0."""
     y_m = -course.direction * BESIDE_M
     world_from_cyclist = world_from_vehicle(course.x_m(time_s), y_m, course.heading_rad)
     return world_from_cyclist @ riding(looks, ahead_m + course.speed_mps * time_s)[part]

@@ -1,4 +1,4 @@
-"""Dusk: a sun 6 degrees above the horizon, long shadows, and warm light under a blue sky."""
+"""Light the street by a sun 6 degrees above the horizon: long shadows, warm light, a blue sky."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Dusk"]
 
 @dataclass(frozen=True)
 class Dusk:
-    """Where the sun stands (``azimuth_deg`` from x towards y), how hazy and cloudy it is."""
+    """The sun's direction (``azimuth_deg`` from x towards y), haze and clouds."""
 
     azimuth_deg: Annotated[float, Range(-360, 360)] = DUSK.azimuth_deg
     elevation_deg: Annotated[float, Range(1, 20)] = DUSK.elevation_deg

@@ -1,8 +1,8 @@
-"""Evening: the sun somewhere between noon and dusk, or on its way while the camera drives.
+"""Light the street by a sun between noon and dusk, which may sink while the camera drives.
 
-A share of 0 is the noon of a scene without a light, 1 the default of ``dusk``; where the sun
-stands, how hazy the air is, the clouds' cover and the exposure go from one to the other in
-proportion. The clouds keep their shapes.
+A share of 0 is the noon of a scene without a light, a share of 1 the default of ``dusk``. The sun's
+direction, the haze, the clouds' cover and the exposure are interpolated linearly between them. The
+clouds keep their shapes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["Evening", "daylight"]
 
 @dataclass(frozen=True)
 class Evening:
-    """The share of the way at time 0, ``start``, and from ``over_s`` on, ``end``."""
+    """The share between noon and dusk: ``start`` at time 0, ``end`` from ``over_s`` on."""
 
     start: Annotated[float, Range(0, 1)] = 0.0
     end: Annotated[float, Range(0, 1)] = 1.0

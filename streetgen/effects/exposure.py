@@ -1,4 +1,4 @@
-"""Exposure drift: a slow wave in stops, as automatic exposure makes it between sun and shade."""
+"""Vary the exposure by a slow wave, as automatic exposure does between sun and shade."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["ExposureDrift"]
 
 @dataclass(frozen=True)
 class ExposureDrift:
-    """``stops`` up and down, once in ``period_s``."""
+    """The wave's amplitude in stops and its period."""
 
     stops: Annotated[float, Range(0, 4)] = 0.3
     period_s: Annotated[float, Range(0.1, 3600)] = 4.0

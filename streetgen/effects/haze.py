@@ -1,6 +1,6 @@
-"""Haze: light is absorbed over distance and replaced by the colour of the air (Koschmieder's law).
+"""Absorb light over distance and add the colour of the air instead (Koschmieder's law).
 
-The haze is a level layer of height ``layer_m``: a ray at elevation e leaves it after
+The haze is a level layer of height ``layer_m``. A ray at elevation e leaves it after
 ``layer_m / sin(e)``, so that the zenith stays partly visible and the horizon does not.
 """
 
@@ -24,8 +24,10 @@ LEAST_UP = 1e-4
 
 @dataclass(frozen=True)
 class Haze:
-    """``visibility_m``: where a black thing keeps 5 % contrast (the meteorological range);
-    ``layer_m``: how high the haze reaches; ``air``: its own linear light.
+    """The haze's density, height and colour.
+
+    A black object at ``visibility_m`` keeps 5 % contrast (the meteorological range). ``layer_m`` is
+    the height of the haze, ``air`` its own linear light.
     """
 
     visibility_m: Annotated[float, Range(10, 100_000)] = 800.0
@@ -43,7 +45,7 @@ class Haze:
 
 
 def _rays(camera: Camera | LensCamera) -> tuple[F32, NDArray[np.float64]]:
-    """How long the pixels' rays are at z = 1, and how steeply they rise in the world."""
+    """Return the length of the pixels' rays at z = 1, and the sine of their elevation."""
     k = camera.intrinsics
     x = (np.arange(k.width_px) + 0.5 - k.cx_px) / k.fx_px
     y = ((np.arange(k.height_px) + 0.5 - k.cy_px) / k.fy_px)[:, None]

@@ -1,4 +1,4 @@
-"""Lens distortion: resamples a pinhole frame as a lens would show it, with the matching camera.
+"""Resample a pinhole frame as a distorting lens would show it.
 
 The lens's focal length is scaled up until every output pixel has a source in the pinhole frame, so
 that no edges stay blank.
@@ -28,7 +28,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LensDistortion:
-    """The coefficients of ``rfcore.lens.BrownLens``."""
+    """The lens's coefficients (``rfcore.lens.BrownLens``)."""
 
     k1: Annotated[float, Range(-1, 1)] = -0.12
     k2: Annotated[float, Range(-1, 1)] = 0.02
@@ -51,7 +51,7 @@ class LensDistortion:
 
 @lru_cache(maxsize=2)
 def _source_map(pinhole: Intrinsics, lens: BrownLens) -> tuple[Intrinsics, F32, F32]:
-    """The lens's intrinsics, and where each pixel comes from; all frames of a drive share it."""
+    """Return the lens's intrinsics and the source of each pixel; a drive's frames share them."""
     intrinsics = _fitting(pinhole, lens)
     u, v = np.meshgrid(np.arange(pinhole.width_px) + 0.5, np.arange(pinhole.height_px) + 0.5)
     source = _source_px(np.stack([u.ravel(), v.ravel()], axis=1), intrinsics, pinhole, lens)
@@ -60,14 +60,14 @@ def _source_map(pinhole: Intrinsics, lens: BrownLens) -> tuple[Intrinsics, F32, 
 
 
 def _source_px(pixels: F64, lensed: Intrinsics, pinhole: Intrinsics, lens: BrownLens) -> F64:
-    """Where in the pinhole's frame the lens's pixels come from."""
+    """Return the positions in the pinhole's frame that the lens's pixels show."""
     sensor = (pixels - (lensed.cx_px, lensed.cy_px)) / (lensed.fx_px, lensed.fy_px)
     directions = lens.undistort(sensor)
     return np.asarray(directions * (pinhole.fx_px, pinhole.fy_px) + (pinhole.cx_px, pinhole.cy_px))
 
 
 def _fitting(pinhole: Intrinsics, lens: BrownLens) -> Intrinsics:
-    """The least zoom at which all pixels of the edge come from inside the frame."""
+    """Return the least zoom at which all pixels of the edge come from inside the frame."""
     k = pinhole
     u, v = np.arange(k.width_px) + 0.5, np.arange(k.height_px) + 0.5
     edge = np.concatenate(

@@ -1,4 +1,4 @@
-"""Sensor noise: photons arrive by chance (Poisson), reading adds electrons (normal)."""
+"""Add the noise of a sensor: Poisson-distributed photons and a normal readout error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["SensorNoise"]
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """``full_well_e``: electrons of a white pixel; ``read_e``: deviation of the readout."""
+    """The electrons of a white pixel, and the standard deviation of the readout."""
 
     full_well_e: Annotated[float, Range(50, 1e6)] = 3000.0
     read_e: Annotated[float, Range(0, 1000)] = 4.0

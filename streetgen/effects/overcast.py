@@ -1,4 +1,4 @@
-"""Overcast: a closed layer of cloud, soft light from everywhere and no shadows."""
+"""Close the sky by a layer of cloud: soft light from everywhere and no shadows."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ __all__ = ["Overcast"]
 
 @dataclass(frozen=True)
 class Overcast:
-    """``unevenness``: deviation of the layer's brightness; ``white``: the exposure, by what a level
-    white sheet gets in the picture.
+    """The layer of cloud and the exposure.
+
+    ``unevenness`` is the deviation of the layer's brightness, ``white`` the linear light of a level
+    white sheet in the picture.
     """
 
     unevenness: Annotated[float, Range(0, 1)] = 0.22

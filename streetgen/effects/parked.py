@@ -1,4 +1,4 @@
-"""Parked vehicles in the bays along the kerb, which a field of the empty street has never seen."""
+"""Park vehicles in the bays along the kerb, which a field of the empty street has never seen."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ __all__ = ["ParkedVehicles"]
 
 GAP_M = 0.5
 ALONG_M, ACROSS_M, TURN_RAD = 0.2, 0.06, 0.015
-"""Deviations of how people park."""
+"""Standard deviations of a vehicle's place and heading from its bay."""
 
 
 @dataclass(frozen=True)
 class ParkedVehicles:
-    """``occupied``: the share of bays with a vehicle in it. On another ``day`` than 0, the share
-    ``turnover`` of the bays has another vehicle or none.
+    """The share of bays that are ``occupied``.
+
+    On another ``day`` than 0 the share ``turnover`` of the bays has another vehicle or none.
     """
 
     occupied: Annotated[float, Range(0, 1)] = 0.7
@@ -45,7 +46,7 @@ class ParkedVehicles:
         return world.plus(StreetPart(tuple(meshes), vehicle_materials()))
 
     def _drawn(self, rng: np.random.Generator) -> tuple[VehicleLooks, np.ndarray] | None:
-        """A vehicle and how it deviates from its bay, or none."""
+        """Return a vehicle and its deviation from the bay, or None for an empty bay."""
         looks, moved = _fitting(rng), rng.normal(0.0, (ALONG_M, ACROSS_M, TURN_RAD))
         return (looks, np.clip(moved, -0.3, 0.3)) if rng.random() < self.occupied else None
 

@@ -1,4 +1,4 @@
-"""A passing cloud: its shadow falls on the whole street for some seconds of the drive.
+"""Let a cloud pass before the sun: its shadow falls on the whole street for some seconds.
 
 The sun's disc is dimmed; the sky and the exposure stay as they are. On a scene without a sun it
 changes nothing.
@@ -21,8 +21,10 @@ __all__ = ["PassingCloud"]
 
 @dataclass(frozen=True)
 class PassingCloud:
-    """From ``start_s`` on the sun is dimmed, within ``edge_s``, to the share ``passed`` of its
-    light; after ``shade_s`` of shade it comes back within the same time.
+    """The times of the shade and the share of light that it lets pass.
+
+    From ``start_s`` on the sun is dimmed, within ``edge_s``, to the share ``passed`` of its light.
+    After ``shade_s`` of shade it comes back within ``edge_s``.
     """
 
     start_s: Annotated[float, Range(0, 3600)] = 1.0

@@ -1,4 +1,4 @@
-"""People who walk along the pavements and across the road, arms and legs swinging."""
+"""Add people who walk along the pavements and across the road."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from streetgen.geometry.world import Mover, StreetPart, World
 __all__ = ["Pedestrians"]
 
 NEAR_M, FAR_M = 1.9, 2.9
-"""Distances from the edge of the road between which pavements are free to walk on."""
+"""The part of the pavement that is free to walk on, as distances from the edge of the road."""
 TURN_BACK_M = 2.2
-"""Who crosses the road turns back so far from its edge."""
+"""Distance from the road's edge at which people who cross it turn back."""
 USUAL_MPS = 1.4
 Way = Callable[[float], tuple[float, F64]]
-"""From a time (s): the way walked (m) and world_from_person (4x4)."""
+"""Maps a time (s) to the way walked (m) and world_from_person (4x4)."""
 
 
 @dataclass(frozen=True)
 class Pedestrians:
-    """People by their places at time 0, along x from the middle of the street.
+    """The people's places at time 0, along x from the middle of the street.
 
     Those of ``along_m`` walk towards +x, those of ``oncoming_m`` towards -x, by turns on the right
     pavement and on the left. Those of ``crossing_m`` cross the road at that x, beginning by turns
@@ -74,12 +74,12 @@ class Pedestrians:
 
 @dataclass(frozen=True)
 class Walker:
-    """Somebody on the way: steps follow from the way walked, so that feet do not slide far."""
+    """A person on a way; steps follow from the way walked, so that feet do not slide far."""
 
     looks: Person
     way: Way
     pace: float
-    """Speed over the usual one; steps are as much longer."""
+    """The speed as a multiple of the usual one; steps are longer by the same factor."""
     phase_rad: float
 
     def world_from_part(self, part: BodyPart, time_s: float) -> F64:
@@ -101,7 +101,9 @@ def _on_pavement(course: Course, y_m: float, time_s: float) -> tuple[float, F64]
 def _crossing(
     x_m: float, side: int, half_m: float, speed_mps: float, time_s: float
 ) -> tuple[float, F64]:
-    """Across a road of ``2 * half_m`` from the kerb of ``side`` and back, over and over."""
+    """Return the way walked and the pose of a person who crosses the road to and fro for ever.
+
+    The road is ``2 * half_m`` wide; the person begins at the kerb of ``side``."""
     walked_m, turn_m = speed_mps * time_s, half_m + TURN_BACK_M
     way_m = (walked_m + TURN_BACK_M) % (4 * turn_m)
     there = way_m < 2 * turn_m

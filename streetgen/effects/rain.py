@@ -1,4 +1,4 @@
-"""Rain: streaks of falling drops, as long as the drops fall while the shutter is open."""
+"""Draw streaks of falling drops, as long as the drops fall while the shutter is open."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ FALL_MPS = 9.0
 DROP_WIDTH_M = 0.0025
 NEAR_M, FAR_M = 1.5, 25.0
 OPACITY = 0.9
-"""Of a streak as wide as a pixel: a drop passes each place in a part of the shutter's time, and is
-brighter than its surroundings, since it gathers the sky.
+"""Opacity of a streak that is as wide as a pixel. A drop covers each place for a part of the
+shutter's time, and is brighter than its surroundings, because it gathers the sky.
 """
 
 
 @dataclass(frozen=True)
 class Rain:
-    """``drops`` in the picture, seen for ``shutter_s``, blown by ``wind_mps`` to the right."""
+    """The number of drops in the picture, the shutter's time, wind to the right, and brightness."""
 
     drops: Annotated[int, Range(0, 100_000)] = 900
     shutter_s: Annotated[float, Range(0.0001, 0.1)] = 0.01

@@ -1,7 +1,7 @@
-"""Rolling shutter: the rows of a picture are exposed one after the other while the camera moves.
+"""Expose the rows of a picture one after the other while the camera moves.
 
-First-order model in the readout time: row v shows the point of each pixel where it was at the row's
-own time, given its depth and the camera's velocity and turn rate at mid-frame.
+The model is of first order in the readout time. Row v shows the point of each pixel where it was at
+the row's own time, given its depth and the camera's velocity and turn rate at mid-frame.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SKY_M = 1e6
 
 @dataclass(frozen=True)
 class RollingShutter:
-    """``readout_s``: from the first row to the last."""
+    """The time from the first row to the last."""
 
     readout_s: Annotated[float, Range(0, 0.1)] = 0.02
 

@@ -1,4 +1,4 @@
-"""Moving vehicles: they keep right, hold their speed, and re-enter the street after leaving it."""
+"""Add vehicles that keep right, hold their speed, and re-enter the street after leaving it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Traffic"]
 
 @dataclass(frozen=True)
 class Traffic:
-    """Vehicles by their places at time 0, along x from the middle of the street.
+    """The vehicles' places at time 0, along x from the middle of the street.
 
     Those of ``along_m`` drive towards +x, as the drive's camera does, those of ``oncoming_m``
     towards -x. Vehicles do not brake: one at the camera's place is seen from inside.

@@ -1,4 +1,4 @@
-"""A tunnel: walls and a roof over a stretch of the road, dark inside.
+"""Roof a stretch of the road by a tunnel, which is dark inside.
 
 Only daylight from its ends comes in (``auto_exposure`` says what the camera does about it).
 """
@@ -23,7 +23,7 @@ WALL_M = 0.4
 
 @dataclass(frozen=True)
 class Tunnel:
-    """From ``start_m`` along x, ``length_m`` long, ``height_m`` high inside."""
+    """The tunnel's begin along x, its length, and its height inside."""
 
     start_m: Annotated[float, Range(-1000, 1000)] = -10.0
     length_m: Annotated[float, Range(1, 500)] = 20.0

@@ -1,4 +1,4 @@
-"""Wet ground: water darkens it, and standing water mirrors the street.
+"""Wet the ground: water darkens it, and puddles mirror the street.
 
 Smoothness varies in patches between wet and dry, because ground is uneven. Water in its pores makes
 stone about half as bright (Lekner and Dorf, "Why some things are darker when wet", Applied Optics
@@ -23,13 +23,13 @@ GROUND = ("asphalt", "slabs", "kerb", "paint", "iron")
 MAP_PX = 512
 SMOOTHEST, ROUGHEST = 0.04, 0.6
 DARKENED = 0.5
-"""Linear reflectance of wet ground over that of dry one."""
+"""The linear reflectance of wet ground divided by that of dry ground."""
 DISPLAY_EXPONENT = 1 / 2.2
 
 
 @dataclass(frozen=True)
 class WetRoad:
-    """``water`` from 0, damp, to 1, mostly puddles."""
+    """The amount of ``water``, from 0 (damp) to 1 (mostly puddles)."""
 
     water: Annotated[float, Range(0, 1)] = 0.5
 
@@ -44,7 +44,7 @@ class WetRoad:
         return replace(dry, colour=_darkened(dry.colour), roughness=self._puddles(rng))
 
     def _puddles(self, rng: np.random.Generator) -> F32:
-        """Roughness [H, W]: smooth in the hollows."""
+        """Return the roughness [H, W], which is low in the hollows."""
         height = fractal((MAP_PX, MAP_PX), 3.2, rng)
         level = 2.4 * (self.water - 0.5)
         dry = 1 / (1 + np.exp(-4 * (height - level)))

@@ -1,6 +1,6 @@
-"""A building site at the edge of the road: a board fence, containers and a heap of gravel.
+"""Add a building site at the edge of the road: a board fence, containers and a heap of gravel.
 
-Its stretch of parking bays is closed: nothing parks there.
+Nothing parks in the bays that the site covers.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from streetgen.geometry.world import StreetPart, World
 __all__ = ["Works"]
 
 NEAR_M, FAR_M = 4.1, ROAD_HALF_M - KERB_M
-"""Distances from the middle of the road between which the site lies: the parking bays, which are
-farther out in a wider street."""
+"""The site lies between these distances from the middle of the road, where the parking bays are. In
+a wider street it is farther out."""
 BOARD_M, BOARD_UP_M, BOARD_THICK_M = 2.0, 1.1, 0.04
 HEAP_M = 5.2
 CONTAINER_M = (6.06, 2.0, 2.59)
@@ -38,8 +38,9 @@ MATERIALS = (
 
 @dataclass(frozen=True)
 class Works:
-    """From ``start_m`` along x, ``length_m`` long, on the left of the road (``side`` 1) or on its
-    right (-1), with ``containers`` in a row.
+    """The site's begin along x, its length, and its number of ``containers`` in a row.
+
+    It is on the left of the road for ``side`` 1, on the right for -1.
     """
 
     start_m: Annotated[float, Range(-1000, 1000)] = 4.0
@@ -76,7 +77,7 @@ class Works:
 
 
 def _fence(closed: Closure, wider_m: float) -> list[Mesh]:
-    """Boards in two colours by turns, along the lane and across both ends."""
+    """Return boards in two alternating colours, along the lane and across both ends."""
     xs = np.arange(closed.start_m, closed.end_m - 1e-6, BOARD_M)
     near, far = sorted(closed.side * (y + wider_m) for y in (NEAR_M, FAR_M))
     lane_y = closed.side * (NEAR_M + wider_m)
@@ -93,7 +94,7 @@ def _fence(closed: Closure, wider_m: float) -> list[Mesh]:
 
 
 def _heap(place: GroundSpot, rng: np.random.Generator) -> Mesh:
-    """A cone of uneven slopes."""
+    """Return a cone of gravel with uneven slopes."""
     up = np.linspace(0.0, rng.uniform(1.0, 1.5), 6)
     path = np.stack([0 * up + place.x_m, 0 * up + place.y_m, up], axis=1)
     radii = np.linspace(1.1, 0.02, 6) * rng.uniform(0.9, 1.0, 6)

@@ -1,4 +1,5 @@
-"""What stands in the street: meshes, what they are made of, and where things go.
+"""Model the things that stand in the street as meshes with materials.
 
-``layout`` says where, the other modules say what. All of it is numpy; no renderer is known here.
+``layout`` plans where things stand, the other modules make them. All of it is numpy; no renderer is
+known here.
 """

@@ -1,4 +1,4 @@
-"""The houses: facades along the street and across its ends, roofs, gables and chimneys.
+"""Make the houses: facades along the street and across its ends, roofs, gables and chimneys.
 
 Wall textures are brick in running bond, plaster with rain streaks, cut stone, and roof tiles.
 """
@@ -22,7 +22,7 @@ __all__ = ["WALL_TILE_M", "bricks", "buildings", "plaster", "roof_tiles", "stone
 
 WALL_TILE_M = 4.0
 SHAPE = (1024, 1024)
-"""256 px a metre: a brick is 64 by 16 px, 25 by 6.2 cm."""
+"""Size of a wall's texture, px, at 256 px a metre: a brick is 64 by 16 px, 25 by 6.2 cm."""
 BRICK_PX, COURSE_PX = 64, 16
 
 
@@ -87,7 +87,7 @@ BRICKS = (
     ((166, 128, 92), (128, 96, 70), (176, 168, 156)),
     ((96, 64, 56), (70, 46, 42), (120, 114, 108)),
 )
-"""Lightest and darkest brick, mortar; 0..255 as painted."""
+"""sRGB colours 0..255 of the lightest brick, the darkest brick and the mortar."""
 PLASTERS = ((214, 198, 160), (178, 182, 184), (200, 150, 118), (170, 178, 158), (206, 188, 184))
 FRAMES = ((0.66, 0.65, 0.61), (0.10, 0.08, 0.06), (0.13, 0.17, 0.15))
 DOORS = ((0.16, 0.06, 0.03), (0.03, 0.09, 0.06), (0.05, 0.07, 0.16), (0.22, 0.04, 0.04))
@@ -118,7 +118,7 @@ def _house(plot: Plot, world_from_facade: F64) -> list[Mesh]:
 
 
 def _shell(plot: Plot, style: BuildingStyle) -> list[Mesh]:
-    """The gable walls, which show where a neighbour is lower or away, and the back."""
+    """Return the back and the gable walls, which show where a neighbour is lower or missing."""
     w, h, d = plot.width_m, plot.height_m, HOUSE_DEPTH_M
     corners = np.array(
         [
@@ -150,7 +150,7 @@ def _roof(plot: Plot, rng: np.random.Generator) -> list[Mesh]:
 
 
 def _across_the_ends(layout: Layout, rng: np.random.Generator) -> list[tuple[Plot, F64]]:
-    """Houses that close the view where the road goes on: one row at each end."""
+    """Return a row of houses for each end, which closes the view where the road goes on."""
     found = []
     for sign in (1, -1):
         outwards = np.array([-float(sign), 0.0, 0.0])

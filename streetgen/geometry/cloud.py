@@ -1,4 +1,4 @@
-"""A layer of cumulus clouds: a periodic block of droplet density and the light scattered in it.
+"""Render a layer of cumulus clouds: a periodic block of droplets and the light scattered in it.
 
 The block is [X, Y, Z] cells over ``EXTENT_M`` of land and ``THICKNESS_M`` of height and repeats
 over the land. It stores a smooth field whose positive part is cloud, so that edges stay sharp
@@ -70,30 +70,31 @@ CELL_M, LAYER_M = EXTENT_M / CELLS, THICKNESS_M / LAYERS
 EXTINCTION_PER_M = 0.03
 ORDERS = 7
 THINNING, DIMMING = np.float32(0.5), np.float32(0.85)
-"""What each further order of scattering keeps of the extinction, and of the light."""
+"""The shares of the extinction and of the light that each further order of scattering keeps."""
 AIR_M = 22_000.0
-"""Where a cloud keeps 1 / e of its contrast against the sky behind it."""
+"""Distance at which a cloud keeps 1 / e of its contrast against the sky behind it."""
 LOWEST_UP = 0.03
-"""Lower than that (2 degrees) the layer is hidden by the air."""
+"""Sine of the elevation (2 degrees) below which the air hides the layer."""
 STEPS = 40
-"""Heights at which a view ray looks: at fewer, clouds seen from the side are terraces."""
+"""Number of heights at which a view ray samples; with fewer, clouds have visible steps."""
 BILLOW_CELLS, BILLOWS = 512, 4
-"""Cells of the billows' noise, which repeats so often within the block: 4.4 m each."""
+"""Cells of the billows' noise, 4.4 m each, and how often it repeats within the block."""
 BILLOW, BILLOW_TURN_M = 1.0, 300.0
-"""How far billows move a cloud's edge, in units of the field, and over which height they change."""
+"""Displacement of a cloud's edge by billows, in units of the field; height of one change, m."""
 CRISP_TO_M = 4_000.0
-"""Billows fade beyond, where they would be finer than the sky picture's pixels."""
+"""Distance beyond which billows fade, since they are finer than the sky picture's pixels."""
 ROWS_AT_ONCE = 32
 LOWEST_SUN_UP = 0.12
-"""The sun's rays are not taken flatter than that through the layer, or all would be in shade."""
+"""Least sine of the sun's elevation within the layer; flatter rays would leave all in shade."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clouds:
-    """``field`` float32 [X, Y, Z], periodic along X and Y; density is its part within 0..1.
+    """The clouds as a field and noise for their edges.
 
-    ``fine`` float32 [2, X', Y'] is noise of smaller cells; what is made of it moves the edges that
-    one sees, but no shadows.
+    ``field`` is float32 [X, Y, Z], periodic along X and Y; density is the field clipped to 0..1.
+    ``fine`` float32 [2, X', Y'] is noise of smaller cells. It moves the visible edges, but not the
+    shadows.
     """
 
     field: F32
@@ -101,11 +102,11 @@ class Clouds:
 
     @property
     def density(self) -> F32:
-        """The share of the full extinction, [X, Y, Z]."""
+        """The density as a share of the full extinction, [X, Y, Z]."""
         return np.clip(self.field, 0.0, 1.0)
 
     def billows(self, height_m: float) -> F32:
-        """What is added to the field at a height above the base: round lobes between creases."""
+        """Return what to add to the field at a height above the base: lobes between creases."""
         turn = 2 * np.pi * height_m / BILLOW_TURN_M
         wave = np.float32(np.cos(turn)) * self.fine[0] + np.float32(np.sin(turn)) * self.fine[1]
         return np.asarray(np.float32(BILLOW) * (np.abs(wave) - np.float32(0.8)), np.float32)
@@ -113,7 +114,7 @@ class Clouds:
 
 @dataclass(frozen=True)
 class CloudLight:
-    """What falls on the clouds: the sun's klux [3] and from where, and the sky's mean radiance."""
+    """The light on the clouds: the sun's klux [3] and direction, and the sky's mean radiance."""
 
     sun_klux: F64
     sun_towards: tuple[float, float, float]
@@ -168,7 +169,7 @@ def over(sky: F32, view: F32, clouds: Clouds, light: CloudLight) -> F32:
 
 
 def _sliced(clouds: Clouds, depth: F32) -> list[tuple[F32, F32, F32]]:
-    """Field, sunwards depth and billows at each of ``STEPS`` heights, linear between layers."""
+    """Return field, sunwards depth and billows at each of ``STEPS`` heights, interpolated."""
     slices = []
     for level in _levels():
         low = int(min(level * LAYERS, LAYERS - 2))
@@ -212,7 +213,7 @@ def _rows_over(sky: F32, view: F32, slices: list[tuple[F32, F32, F32]], light: C
 
 
 def _shone(sunwards: F32, phases: F32, level: float, light: CloudLight) -> F32:
-    """Light scattered into the view [N, 3]: the sun's by orders, and the sky's from above."""
+    """Return the light scattered into the view [N, 3]: the sun's by orders, and the sky's."""
     passed = np.exp(-sunwards)
     sun = np.zeros_like(sunwards)
     for order in range(ORDERS):
@@ -226,7 +227,7 @@ def _shone(sunwards: F32, phases: F32, level: float, light: CloudLight) -> F32:
 
 
 def _phases(cos_scattered: F32) -> F32:
-    """Henyey-Greenstein with a strong forward and a weak backward lobe, [..., ORDERS]."""
+    """Return a strong forward and a weak backward Henyey-Greenstein lobe, [..., ORDERS]."""
     halved = THINNING ** np.arange(ORDERS, dtype=np.float32)
 
     def lobe(g: F32) -> F32:
@@ -240,7 +241,7 @@ def _phases(cos_scattered: F32) -> F32:
 
 
 def _noise(rng: np.random.Generator, slope: float, least: float) -> F32:
-    """Noise [X, Y, Z] of deviation 1 whose power falls with frequency; none slower than least."""
+    """Return noise [X, Y, Z] of deviation 1 whose power falls with frequency from ``least`` on."""
     x, y = (np.fft.fftfreq(CELLS) * CELLS for _ in range(2))
     z = np.fft.rfftfreq(LAYERS) * LAYERS * (EXTENT_M / THICKNESS_M)
     f = np.sqrt(x[:, None, None] ** 2 + y[None, :, None] ** 2 + z[None, None, :] ** 2)
@@ -251,7 +252,7 @@ def _noise(rng: np.random.Generator, slope: float, least: float) -> F32:
 
 
 def _fine_noise(rng: np.random.Generator) -> F32:
-    """Noise [X', Y'] of deviation 1, of waves shorter than an eighth of its extent."""
+    """Return noise [X', Y'] of deviation 1, of waves shorter than an eighth of its extent."""
     f = np.hypot(np.fft.fftfreq(BILLOW_CELLS)[:, None], np.fft.rfftfreq(BILLOW_CELLS)[None])
     f *= BILLOW_CELLS
     weight = np.where(f >= 8, np.maximum(f, 1.0) ** -1.9, 0.0)
@@ -261,7 +262,7 @@ def _fine_noise(rng: np.random.Generator) -> F32:
 
 
 def _blurred(values: F32, cells: int) -> F64:
-    """Periodic Gaussian blur of [X, Y]."""
+    """Return [X, Y] blurred by a periodic Gaussian."""
     f = np.fft.fftfreq(len(values))
     kernel = np.exp(-2 * (np.pi * cells) ** 2 * (f[:, None] ** 2 + f[None, :] ** 2))
     return np.asarray(np.fft.ifft2(np.fft.fft2(values) * kernel).real)

@@ -1,8 +1,8 @@
-"""Bicycles and who rides them: wheels that roll, a crank that turns, legs that follow the pedals.
+"""Model cyclists: wheels roll, the crank turns, and the legs follow the pedals.
 
-Frames are those of ``person``: x points forward, y to the left and z up, with the origin on the
-ground below the bottom bracket. Lengths are of a city bicycle with wheels of 28 inches; its saddle
-is as high as the rider's legs have it.
+As in ``person`` x points forward, y to the left and z up. The origin is on the ground below the
+bottom bracket. Lengths are of a city bicycle with wheels of 28 inches; the saddle's height fits the
+rider's legs.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ BRACKET_M: Point = (0.0, 0.28)
 HEAD_LOW_M, HEAD_HIGH_M = (0.475, 0.66), (0.42, 0.84)
 CRANK_M, PEDAL_THICK_M = 0.17, 0.024
 BALL_M = 0.10
-"""From the ankle forward to the ball of the foot, which is over the pedal's axle."""
+"""Distance from the ankle forward to the ball of the foot, which is over the pedal's axle."""
 GEAR_M = 4.8
-"""What a turn of the crank covers."""
+"""Distance ridden in a turn of the crank."""
 SEAT_TUBE = (-math.sin(0.30), math.cos(0.30))
 STRETCHED = 0.97
-"""How straight a leg is at the lowest pedal: hip to ankle over the length of thigh and shank."""
+"""Distance from hip to ankle at the lowest pedal over the length of thigh and shank."""
 LEAN_RAD, NOD_RAD = 0.5, 0.15
 GRIP_M, GRIP_UP_M = 0.38, 0.08
-"""Where the hands are: along x, and above the hips."""
+"""Position of the hands along x, and their height above the hips."""
 
 PAINTS = {
     "bicycle black": (0.014, 0.014, 0.015),
@@ -93,7 +93,7 @@ class Cyclist:
 
     @property
     def hip_m(self) -> Point:
-        """Where the hips are: on the line of the seat tube, so that the leg reaches each pedal."""
+        """The place of the hips on the line of the seat tube, where legs reach each pedal."""
         reach_m = STRETCHED * (THIGH + SHANK) * self.rider.height_m - CRANK_M
         from_orbit = np.subtract(BRACKET_M, self._orbit_m)
         along = float(from_orbit @ SEAT_TUBE)
@@ -102,7 +102,7 @@ class Cyclist:
 
     @property
     def pedal_y_m(self) -> float:
-        """How far from the middle the pedals are: below the hips."""
+        """Distance of the pedals from the middle; they are below the hips."""
         return HIP_APART * self.rider.height_m
 
     @property
@@ -156,7 +156,7 @@ def _leg(looks: Cyclist, ankle_m: Point, side: int) -> dict[BodyPart, F64]:
 
 
 def _upper_body(looks: Cyclist) -> dict[BodyPart, F64]:
-    """It does not move: the back leans forward, hands hold the grips."""
+    """Return the frames of the upper body, which does not move: the hands hold the grips."""
     size, hip = looks.rider.height_m, looks.hip_m
     shoulder, neck = (
         (hip[0] + up * size * math.sin(LEAN_RAD), hip[1] + up * size * math.cos(LEAN_RAD))
@@ -177,7 +177,7 @@ def _grip_m(looks: Cyclist) -> Point:
 
 
 def _bent(start: Point, end: Point, lengths: tuple[float, float], way: int) -> tuple[float, float]:
-    """Angles of two limbs between places; ``way`` 1 bends the joint forward, -1 back.
+    """Return the angles of two limbs between places; ``way`` 1 bends the joint forward, -1 back.
 
     A limb is stretched towards what it does not reach.
     """
@@ -202,7 +202,7 @@ def cyclist_parts(looks: Cyclist) -> dict[str, tuple[Mesh, ...]]:
 
 
 def _frame(looks: Cyclist) -> list[Mesh]:
-    """The tubes, saddle and handlebars."""
+    """Return the tubes, the saddle and the handlebars."""
     paint = Surface(looks.paint, Label.BICYCLE)
     hip, grip = looks.hip_m, _grip_m(looks)
     saddle = hip[0], hip[1] - 0.055 * looks.rider.height_m
@@ -236,7 +236,7 @@ SPOKES = 16
 
 
 def _wheel() -> list[Mesh]:
-    """About the y axis with its middle at the origin: tyre, rim, spokes and hub."""
+    """Return a wheel about the y axis with its middle at the origin: tyre, rim, spokes and hub."""
     turn = np.linspace(0.5 * np.pi, -1.5 * np.pi, 9)
     middle_m = WHEEL_RADIUS_M - TYRE_RADIUS_M
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -254,7 +254,7 @@ def _spoke(number: int, reach_m: float) -> Mesh:
 
 
 def _crank(pedal_y_m: float) -> list[Mesh]:
-    """The chainring on the right and two arms; the left one hangs down."""
+    """Return the chainring on the right and two arms, of which the left one hangs down."""
     ring_y = -0.045
     found = [
         disc(METAL, (0, ring_y, 0), (0, -1, 0), 0.09),

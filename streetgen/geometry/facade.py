@@ -1,4 +1,4 @@
-"""A facade: ground floor with shop or dwelling, windows above, and parts that protrude.
+"""Make a facade: ground floor with shop or dwelling, windows above, and parts that protrude.
 
 Everything is in the facade's own axes (``Plot.world_from_facade``): u along the wall to the right,
 v up, w out of the wall. An opening is a row (u0, v0, u1, v1) in metres; it gets reveals, a frame, a
@@ -162,7 +162,7 @@ METAL = Surface("metal", Label.BUILDING)
 
 @dataclass(frozen=True)
 class BuildingStyle:
-    """What a building is made of."""
+    """The surfaces that a building is made of."""
 
     wall: Surface
     frame: Surface
@@ -279,7 +279,7 @@ def _balcony(window: F64) -> list[Mesh]:
 
 
 def _edges(plot: Plot, style: BuildingStyle) -> list[Mesh]:
-    """Plinth, string course, cornice, the wall under the eaves, and a rain pipe."""
+    """Return plinth, string course, cornice, the wall under the eaves, and a rain pipe."""
     width, top = plot.width_m, plot.height_m
     eaves = plot.ground_m + plot.floors * plot.floor_m
     courses = boxes(

@@ -1,4 +1,4 @@
-"""Street furniture: lamp posts, wires, railings and bollards, traffic signs and traffic lights.
+"""Make street furniture: lamp posts, wires, railings, bollards, traffic signs and lights.
 
 Each sign has its own post at one of the layout's places and faces oncoming drivers. Traffic lights
 stand before the crossings, one at the pavement and one on an arm over the lane.
@@ -31,7 +31,7 @@ WIRE_HEIGHTS_M = (6.6, 6.9)
 SAG_M = 0.5
 SPAN_UP_M = 8.1
 RAIL_M = 7.05
-"""From the middle of the road to railings and bollards."""
+"""Distance from the middle of the road to railings and bollards."""
 
 
 def lamps(layout: Layout, _rng: np.random.Generator) -> StreetPart:
@@ -125,11 +125,11 @@ FACE = Surface("sign face", Label.SIGN)
 NAME = Surface("street name", Label.SIGN)
 CASE = Surface("signal case", Label.SIGN)
 UNDER_M = 0.3
-"""Posts begin so far under the pavement."""
+"""Depth under the pavement at which posts begin."""
 FACE_M = 0.60
 CENTRE_M = 2.45
 LIGHT_OFFSET_M, LIGHT_M = 2.6, 6.95
-"""Traffic lights stand so far before the middle of a crossing, and from the middle of the road."""
+"""Distances of traffic lights from the middle of a crossing and from the middle of the road."""
 LENS_RADIUS_M = 0.10
 CASE_HALF_M = np.array([0.06, 0.16, 0.46])
 BOARD_M = np.array([0.012, 0.11, 0.14])
@@ -192,7 +192,7 @@ def _post(top_m: float, radius_m: float) -> Mesh:
 
 
 def _panel(size_m: tuple[float, float], centre_m: float, front: Surface, uv: F32) -> list[Mesh]:
-    """A sheet of metal clamped to the post, its picture towards x."""
+    """Return a sheet of metal clamped to the post, its picture towards x."""
     half_w, half_h = 0.5 * size_m[0], 0.5 * size_m[1]
     low, high = (0.036, -half_w, centre_m - half_h), (0.05, half_w, centre_m + half_h)
     clamp = boxes(SIGN_POST, (-0.036, -0.045, centre_m - 0.02), (0.036, 0.045, centre_m + 0.02))
@@ -202,7 +202,7 @@ def _panel(size_m: tuple[float, float], centre_m: float, front: Surface, uv: F32
 
 
 def _round_panel(face: int) -> list[Mesh]:
-    """A round sheet; the disc's picture is a row of the faces' texture."""
+    """Return a round sheet; the disc's picture is a row of the faces' texture."""
     clamp = boxes(SIGN_POST, (-0.036, -0.045, CENTRE_M - 0.02), (0.036, 0.045, CENTRE_M + 0.02))
     back = disc(SIGN_BACK, (0.04, 0, CENTRE_M), (-1, 0, 0), 0.5 * FACE_M, 32)
     front = disc(FACE, (0.05, 0, CENTRE_M), (1, 0, 0), 0.5 * FACE_M, 32)
@@ -216,7 +216,7 @@ def _round_panel(face: int) -> list[Mesh]:
 
 
 def _lamp_case(centre: F64, lit: int) -> list[Mesh]:
-    """A case with three lenses under hoods, and its dark board behind."""
+    """Return a case with three lenses under hoods, and its dark board behind."""
     meshes = [
         boxes(CASE, centre - CASE_HALF_M, centre + CASE_HALF_M),
         boxes(CASE, centre - CASE_HALF_M - BOARD_M, centre + CASE_HALF_M * (-1, 1, 1) + BOARD_M),
@@ -230,7 +230,7 @@ def _lamp_case(centre: F64, lit: int) -> list[Mesh]:
 
 
 def _hood(middle: F64) -> Mesh:
-    """Half a tube over a lens, longer above."""
+    """Return half a tube over a lens, longer above."""
     turn = np.linspace(-0.15 * np.pi, 1.15 * np.pi, 13)
     radius = LENS_RADIUS_M + 0.012
     ring = np.stack([0 * turn, radius * np.cos(turn), radius * np.sin(turn)], axis=1) + middle
@@ -240,7 +240,7 @@ def _hood(middle: F64) -> Mesh:
 
 
 def _facing(place: GroundSpot) -> F64:
-    """The sign's x axis towards the place's heading; its arm (-y) reaches over the road."""
+    """Return world_from_sign: x points along the heading, the arm (-y) reaches over the road."""
     cos, sin = np.cos(place.heading_rad), np.sin(place.heading_rad)
     x, y, z = place.x_m, place.y_m, place.z_m
     return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, z], [0, 0, 0, 1]])

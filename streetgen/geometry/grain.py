@@ -1,4 +1,4 @@
-"""Noise for painted textures: it repeats without a seam, as textures do.
+"""Make noise for painted textures, which repeats without a seam, as textures do.
 
 Fractal noise is grown: each octave doubles the picture so far and adds finer grains. At 2048 px
 that takes a third of the time of filtering white noise by FFT.

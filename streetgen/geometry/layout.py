@@ -1,4 +1,4 @@
-"""Where things are in the street: a plan computed from the scene's geometry and seed alone.
+"""Plan where things are in the street, from the scene's geometry and seed alone.
 
 The street runs along x, centred on 0; traffic keeps right, so the lane towards +x lies at y < 0.
 ``side`` is +1 for the left edge of the road (y > 0) and -1 for the right one. From the middle
@@ -49,17 +49,17 @@ CROSSING_SPACING_M, CROSSING_M = 80.0, 3.2
 FASCIA_M = (3.35, 3.95)
 """Height of the band over the ground floor that facades leave bare for a sign."""
 BEYOND_M = 40.0
-"""How far road and pavement go on behind the last facades."""
+"""Length of road and pavement beyond the last facades."""
 SIDES = (1, -1)
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """The street. ``tiles`` of ``length_m`` each follow one another.
+    """The street's measures. ``tiles`` of ``length_m`` each follow one another.
 
-    ``wider_m``: how much farther from the middle everything from the parking bays outwards is, on
-    either side, than in a street whose road is 13.2 m wide. ``floors``: the fewest and the most
-    that houses have above the ground floor.
+    ``wider_m`` moves everything from the parking bays outwards away from the middle, on either
+    side; at 0 the road is 13.2 m wide. ``floors`` are the fewest and the most that houses have
+    above the ground floor.
     """
 
     length_m: Annotated[float, Range(20, 1000)] = 120.0
@@ -108,17 +108,17 @@ class Plot:
 
     @property
     def width_m(self) -> float:
-        """How wide the facade is."""
+        """Width of the facade."""
         return self.end_m - self.start_m
 
     @property
     def height_m(self) -> float:
-        """From the road to the eaves."""
+        """Height from the road to the eaves."""
         return self.ground_m + self.floors * self.floor_m + 0.6
 
     @property
     def world_from_facade(self) -> F64:
-        """From (along the facade to the right, up, out of the wall) to the world, 4x4."""
+        """4x4 matrix from facade axes (to the right, up, out of the wall) to the world."""
         along = (float(self.side), 0.0, 0.0)
         corner = (self.start_m if self.side > 0 else self.end_m, self.y_m, 0.0)
         outwards = (0.0, -float(self.side), 0.0)
@@ -138,10 +138,9 @@ class Closure:
 
 @dataclass(frozen=True)
 class Course:
-    """Where something that moves along the street began, which way it goes and how fast.
+    """A uniform motion along the street that starts again at the other end.
 
-    ``start_m`` is its x at time 0; at ``reach_m`` from the middle of the street it begins again at
-    the other end.
+    ``start_m`` is x at time 0; the other end follows at ``reach_m`` from the middle of the street.
     """
 
     start_m: float
@@ -159,13 +158,13 @@ class Course:
                 yield number, Course(start_m, direction, speed_mps, layout.end_m + BEYOND_M)
 
     def x_m(self, time_s: float) -> float:
-        """Return where it is."""
+        """Return the place along x."""
         moved_m = self.start_m + self.direction * self.speed_mps * time_s
         return (moved_m + self.reach_m) % (2 * self.reach_m) - self.reach_m
 
     @property
     def heading_rad(self) -> float:
-        """Return where it looks, from x towards y."""
+        """The heading, from x towards y."""
         return 0.0 if self.direction > 0 else float(np.pi)
 
 
@@ -178,22 +177,22 @@ class Layout:
 
     @property
     def start_m(self) -> float:
-        """Where the facades begin, x."""
+        """x at which the facades begin."""
         return -0.5 * self.geometry.length_m * self.geometry.tiles
 
     @property
     def end_m(self) -> float:
-        """Where the facades end, x."""
+        """x at which the facades end."""
         return -self.start_m
 
     @property
     def road_half_m(self) -> float:
-        """From the middle of the road to its edge, where the kerb begins."""
+        """Distance from the middle of the road to its edge, where the kerb begins."""
         return ROAD_HALF_M + self.geometry.wider_m
 
     @property
     def facade_m(self) -> float:
-        """From the middle of the road to the facades."""
+        """Distance from the middle of the road to the facades."""
         return FACADE_M + self.geometry.wider_m
 
     @cached_property
@@ -215,7 +214,7 @@ class Layout:
 
     @cached_property
     def trees(self) -> tuple[GroundSpot, ...]:
-        """Where trees may stand: off lamps and crossings; the headings are by chance."""
+        """The feet of the trees, away from lamps and crossings; the headings are random."""
         rng = np.random.default_rng([self.geometry.seed, 2])
         taken = [(lamp.x_m, lamp.side) for lamp in self.lamps]
         kept = []
@@ -229,7 +228,7 @@ class Layout:
 
     @cached_property
     def signposts(self) -> tuple[GroundSpot, ...]:
-        """Feet of traffic signs; the headings look at who drives towards them."""
+        """The feet of traffic signs, which face oncoming drivers."""
         found = self._along(SIGN_M, 15.0, SIGN_SPACING_M, stagger_m=9.0)
         return tuple(
             GroundSpot(p.x_m, p.y_m, p.z_m, p.side, 0.0 if p.side > 0 else np.pi) for p in found
@@ -237,7 +236,7 @@ class Layout:
 
     @cached_property
     def bays(self) -> tuple[GroundSpot, ...]:
-        """Middles of the open parking bays, off the crossings; headings along the traffic."""
+        """The middles of the open parking bays, away from crossings; headings along the traffic."""
         found = self._along(BAY_M, 5.0, BAY_LENGTH_M, stagger_m=0.0)
         return tuple(
             GroundSpot(p.x_m, p.y_m, 0.0, p.side, np.pi if p.side > 0 else 0.0)
@@ -253,14 +252,14 @@ class Layout:
         )
 
     def at_crossing(self, x_m: float, margin_m: float) -> bool:
-        """Whether x is on a crossing or nearer to it than the margin."""
+        """Return whether x is on a crossing or nearer to one than the margin."""
         reach_m = 0.5 * CROSSING_M + margin_m
         return any(abs(x_m - crossing) < reach_m for crossing in self.crossings_x_m)
 
     def _along(
         self, y_m: float, first_m: float, spacing_m: float, stagger_m: float
     ) -> tuple[GroundSpot, ...]:
-        """Places on both sides; ``y_m`` is that of a street that is not wider."""
+        """Return evenly spaced spots on both sides; ``y_m`` is for a street of ``wider_m`` 0."""
         y_m += self.geometry.wider_m
         return tuple(
             GroundSpot(float(x), side * y_m, PAVEMENT_UP_M, side, -0.5 * np.pi * side)

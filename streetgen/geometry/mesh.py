@@ -1,4 +1,4 @@
-"""Triangle meshes in the street's world frame, their classes, and renderer-independent materials.
+"""Hold triangle meshes in the street's world frame, and materials that no renderer is needed for.
 
 The world is right-handed and in metres: x along the street, y to the left when looking along x, z
 up, the road's surface at z = 0. Faces are anticlockwise seen from outside. ``uv`` is in units of
@@ -44,8 +44,8 @@ I32 = NDArray[np.int32]
 class Mesh:
     """Triangles of one material and one label.
 
-    ``vertices`` float32 [V, 3], ``faces`` int32 [F, 3], ``uv`` float32 [V, 2]; ``normals`` float32
-    [V, 3], of length 1, for surfaces that shall look smooth, ``None`` for flat faces. Raises
+    ``vertices`` are float32 [V, 3], ``faces`` int32 [F, 3], ``uv`` float32 [V, 2]. ``normals`` are
+    unit vectors, float32 [V, 3], for surfaces that look smooth, or None for flat faces. Raises
     ``InvalidInput`` for other shapes or types, indices out of range, and values that are not
     finite.
     """
@@ -137,10 +137,10 @@ Texture = NDArray[np.uint8]
 class Material:
     """A surface seen from both sides.
 
-    ``colour``: linear reflectance 0..1, or a texture uint8 [H, W, 3]. ``roughness`` 0.02..1, or a
-    map float32 [H, W] of it on the same uv; at 0.85 and more a dielectric is simply matt.
-    ``metallic`` 0..1. ``gloss``: whether a clear layer lies over the colour; ``roughness`` is then
-    not used. ``transmission`` 0..1: the share of light that passes unbent.
+    ``colour`` is a linear reflectance 0..1, or a texture uint8 [H, W, 3]. ``roughness`` is
+    0.02..1, or a map float32 [H, W] of it on the same uv; from 0.85 on a dielectric is matt.
+    ``metallic`` is 0..1. With ``gloss`` a clear layer lies over the colour, and ``roughness`` is
+    not used. ``transmission`` 0..1 is the share of light that passes unbent.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""People on foot: bodies of smooth parts, jointed at hips, knees, shoulders and elbows.
+"""Model people on foot: smooth parts, jointed at hips, knees, shoulders and elbows.
 
 In a person's frame x points forward, y to the left and z up; its origin is on the ground below the
 hips. Each part has a frame of its own with the joint as origin, in which a limb hangs down to -z;
@@ -44,16 +44,16 @@ BodyPart = tuple[str, int]
 """A part's name and its side: 1 left, -1 right, 0 in the middle."""
 SIDES = (1, -1)
 HIP, SHOULDER = 0.530, 0.792
-"""Heights of the joints of somebody who stands."""
+"""Heights of the joints of a standing person."""
 HIP_APART, SHOULDER_APART = 0.050, 0.112
-"""From the middle of the body to a joint."""
+"""Distances of the joints from the middle of the body."""
 THIGH, SHANK, UPPER_ARM, FOREARM = 0.245, 0.246, 0.186, 0.146
 HAND = 0.045
-"""From the wrist to the middle of the hand."""
+"""Distance from the wrist to the middle of the hand."""
 NECK_FOOT = 0.285
-"""From the hips up to where the head's part begins."""
+"""Distance from the hips up to where the head's part begins."""
 ANKLE = 0.039
-"""From the ankle down to the sole, which reaches from ``HEEL`` to ``TOE`` along x."""
+"""Distance from the ankle down to the sole, which reaches from ``HEEL`` to ``TOE`` along x."""
 HEEL, TOE = -0.029, 0.113
 POINT = 1e-4
 """Half width of the section that closes a body."""
@@ -99,7 +99,7 @@ def person_materials() -> tuple[Material, ...]:
 
 @dataclass(frozen=True)
 class Person:
-    """What somebody looks like: the height and the names of materials."""
+    """A person's height and the names of the materials of skin, hair and clothes."""
 
     height_m: float = 1.72
     coat: str = "coat navy"
@@ -163,7 +163,7 @@ def body_parts(looks: Person) -> dict[str, tuple[Mesh, ...]]:
 
 
 def _head(skin: Surface, hair: Surface) -> list[Mesh]:
-    """The neck, the head over it, and hair over its crown and back."""
+    """Return the neck, the head over it, and hair over its crown and back."""
     neck = np.array(NECK) - (NECK_FOOT, 0.0, 0.0, 0.0)
     return [
         loft(skin, neck),
@@ -173,7 +173,7 @@ def _head(skin: Surface, hair: Surface) -> list[Mesh]:
 
 
 def _limb(surface: Surface, length: float, radius: float, end_radius: float) -> Mesh:
-    """A cone from the joint down, with round ends about the joint and the next one."""
+    """Return a cone from the joint down, with round ends about the joint and the next one."""
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 9)
     low, high = turn[:5], turn[4:]
     heights = [end_radius * np.sin(low) - length, radius * np.sin(high)]
@@ -184,7 +184,7 @@ def _limb(surface: Surface, length: float, radius: float, end_radius: float) -> 
 
 
 def _ball(surface: Surface, middle: tuple[float, float], radii: tuple[float, float, float]) -> Mesh:
-    """An ellipsoid about (x, z) with radii along x, y and z."""
+    """Return an ellipsoid about (x, z) with radii along x, y and z."""
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 11)
     wide = np.maximum(np.cos(turn), 1e-3)
     (x, z), (rx, ry, rz) = middle, radii
@@ -200,14 +200,14 @@ def hinge(x_m: float, y_m: float, z_m: float, swing_rad: float) -> F64:
 
 
 FRONT_RAD, BACK_RAD = 0.54, 0.32
-"""How far a thigh swings before and behind the body at a walk of 1.4 m/s."""
+"""Angles of a thigh's swing before and behind the body at a walk of 1.4 m/s."""
 STANDING_BEND_RAD, SWINGING_BEND_RAD = 0.06, 0.95
-"""How far a knee is bent, and how much more in the middle of its swing forward."""
+"""Angle of a knee on the ground, and the addition in the middle of its swing forward."""
 ARM_RAD, ELBOW_RAD = 0.38, 0.30
 
 
 def stride_m(looks: Person, swing: float) -> float:
-    """Return what two steps cover; at ``swing`` 1 thighs swing as at 1.4 m/s, at 0 nobody walks."""
+    """Return the length of two steps; ``swing`` 1 is a walk of 1.4 m/s, 0 is standing."""
     leg_m = (THIGH + SHANK) * looks.height_m
     return 2 * leg_m * (math.sin(FRONT_RAD * swing) + math.sin(BACK_RAD * swing))
 
@@ -266,7 +266,7 @@ def hung(
 
 
 def _leg(phase_rad: float, swing: float) -> tuple[float, float]:
-    """Angles of thigh and shank against the vertical.
+    """Return the angles of thigh and shank against the vertical.
 
     From 0 to pi the foot is on the ground and stays there: the ankle moves back at the speed that
     the body moves forward. From pi to 2 pi the leg swings forward with a bent knee.
@@ -285,7 +285,7 @@ def _leg(phase_rad: float, swing: float) -> tuple[float, float]:
 
 
 def _lowest(thigh_rad: float, shank_rad: float) -> float:
-    """How far below the hip the sole reaches, as a negative share of the height."""
+    """Return the sole's lowest point below the hip as a negative share of the height."""
     knee = -THIGH * np.cos(thigh_rad) - SHANK * np.cos(shank_rad)
     tips = [end * np.sin(shank_rad) - ANKLE * np.cos(shank_rad) for end in (HEEL, TOE)]
     return float(knee + min(tips))

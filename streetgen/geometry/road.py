@@ -1,4 +1,4 @@
-"""The ground: road, kerbs, pavements, markings and manholes, and their textures.
+"""Make the ground: road, kerbs, pavements, markings and manholes, with their textures.
 
 Asphalt has cracks and patches, pavements are slabs, and paint is worn.
 """
@@ -97,7 +97,7 @@ PAINT = Surface("paint", Label.MARKING, 2.0)
 IRON = Surface("iron", Label.ROAD)
 BAY_LINE_M, ZEBRA_HALF_M = 4.2, 6.0
 PAINT_UP_M = 0.004
-"""Markings lie this much above the road, less than any depth map resolves at 10 m."""
+"""Height of the markings above the road, less than any depth map resolves at 10 m."""
 PAVEMENT_TO_M = 30.0
 
 
@@ -122,7 +122,7 @@ def road(layout: Layout, rng: np.random.Generator) -> StreetPart:
 
 
 def _edge(side: int, start: float, end: float, half_m: float) -> list[Mesh]:
-    """Kerb stones of a metre with joints between them, and the pavement behind."""
+    """Return kerb stones of a metre with joints between them, and the pavement behind."""
     stones = np.arange(start, end, 1.0)
     inner, outer = sorted((side * half_m, side * (half_m + KERB_M)))
     ones = np.ones_like(stones)
@@ -148,7 +148,7 @@ def _markings(layout: Layout) -> list[Mesh]:
 
 
 def _bay_lines(layout: Layout, side: int) -> list[F64]:
-    """A line along the bays of a side, which a crossing interrupts, and one between any two."""
+    """Return a line along the bays of a side, which crossings interrupt, and lines between them."""
     middles = np.array([bay.x_m for bay in layout.bays if bay.side == side])
     starts = middles - BAY_LENGTH_M / 2
     edges = np.unique(np.round(np.concatenate([starts, starts + BAY_LENGTH_M]), 3))
@@ -174,7 +174,7 @@ def _strips(start: F64, length: float, low: float, high: float) -> F64:
 
 
 def _flat(surface: Surface, areas: F64, z_m: float) -> Mesh:
-    """Rectangles (x0, y0, x1, y1) [N, 4] that look up; their texture lies on the ground."""
+    """Return rectangles (x0, y0, x1, y1) [N, 4] that look up."""
     x0, y0, x1, y1 = areas.T
     corners = np.stack(
         [np.stack([x, y], axis=1) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1

@@ -1,4 +1,4 @@
-"""Painted signs: lettering on plates and boards, and the faces of traffic signs, as textures.
+"""Paint signs as textures: lettering on plates and boards, and the faces of traffic signs.
 
 Pictures of one kind are stacked into one texture, one row each (``atlas``, ``atlas_uv``).
 """
@@ -146,7 +146,7 @@ def face_picture(text: str) -> Texture:
 
 
 def _limit(text: str) -> Texture:
-    """A speed limit: black figures in a red ring."""
+    """Paint a speed limit: black figures in a red ring."""
     picture = board(Lettered(text, BLACK, WHITE, border=False), (SIDE_PX, SIDE_PX))
     return _ringed(picture)
 
@@ -172,7 +172,7 @@ def _give_way() -> Texture:
 
 
 def _crossing() -> Texture:
-    """A walker on stripes in a triangle on blue."""
+    """Paint a walker on stripes in a triangle on blue."""
     picture = _plain(BLUE)
     cv2.fillPoly(picture, [np.array([[128, 26], [232, 222], [24, 222]])], WHITE, cv2.LINE_AA)
     cv2.circle(picture, (132, 92), 13, BLACK, -1, cv2.LINE_AA)

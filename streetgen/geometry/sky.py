@@ -1,11 +1,12 @@
-"""The light over the street: clear skies with clouds, evenings, overcast skies.
+"""Compute the light over the street: clear skies with clouds, evenings, overcast skies.
 
 Row i of a sky picture [H, 2 H, 3] looks (i + 0.5) / H pi away from the zenith, column j
 (j + 0.5) / H pi from x towards y. Radiance is in kcd/m^2, so that irradiance is in klux.
 
-The clear sky is Preetham, Shirley and Smits, "A practical analytic model for daylight", SIGGRAPH
-1999: luminance and chromaticity are Perez functions of two angles, with coefficients linear in the
-turbidity (2: mountain air, 3: clear, 6: hazy); the sun passes Rayleigh, aerosol and ozone layers.
+The clear sky follows Preetham, Shirley and Smits, "A practical analytic model for daylight",
+SIGGRAPH 1999. Luminance and chromaticity are Perez functions of two angles, whose coefficients are
+linear in the turbidity (2: mountain air, 3: clear, 6: hazy). The sun's light passes Rayleigh,
+aerosol and ozone layers.
 
 ``exposure`` is fixed for each light, not derived from pictures, so that the frames of a drive stay
 comparable.
@@ -87,7 +88,7 @@ def with_ground(radiance: F32, sun_klux: F64) -> F32:
 
 SUN_DIAMETER_DEG = 0.53
 SUN_ABOVE_AIR_KLUX = 128.0
-"""Solar illuminance constant."""
+"""The solar illuminance constant."""
 LUMINANCE = np.array(
     [
         (0.1787, -1.4630),
@@ -130,13 +131,13 @@ ZENITH_Y = np.array(
         (0.15346, -0.26756, 0.06670, 0.26688),
     ]
 )
-"""Zenith chromaticity: rows by turbidity squared, turbidity, 1; columns by cubes of the angle."""
+"""Zenith chromaticity: a row for turbidity squared, turbidity and 1, a column for each power."""
 RGB_FROM_XYZ = np.array(
     [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
 )
-"""IEC 61966-2-1."""
+"""The matrix of IEC 61966-2-1."""
 WAVELENGTHS_UM = np.array([0.615, 0.535, 0.445])
-"""Where red, green and blue of sRGB are purest, roughly."""
+"""Approximate wavelengths of the primaries of sRGB."""
 OZONE_PER_CM = np.array([0.110, 0.070, 0.005])
 OZONE_CM = 0.35
 LOWEST_DEG = 1.0
@@ -180,7 +181,7 @@ def sun_disc_sr(diameter_deg: float) -> float:
 
 
 def _perez(table: F64, turbidity: float, cos_view: F64, cos_sun: F64, up: float) -> F64:
-    """F(view) / F(zenith) of equation 3."""
+    """Return F(view) / F(zenith) of equation 3."""
     a, b, c, d, e = table @ (turbidity, 1.0)
 
     def perez(cos_away: F64 | float, cos_gamma: F64 | float) -> F64:
@@ -197,17 +198,17 @@ def _zenith(table: F64, turbidity: float, away: float) -> float:
 
 
 HEIGHT = 1024
-"""Rows of a sky picture: 0.18 degrees each, three pixels of a 1920x1080 picture 90 degrees wide."""
+"""Rows of a sky picture: 0.18 degrees each, 3 px of a 1920x1080 picture 90 degrees wide."""
 OVERCAST_ZENITH_KCD = 9.0
 OVERCAST_TINT = np.array([0.97, 1.0, 1.05])
 
 
 @dataclass(frozen=True)
 class Daylight:
-    """Where the sun stands, how hazy the air is, and how much of the sky has clouds.
+    """The sun's direction, the haze, the clouds and the exposure.
 
-    ``white`` is the linear light that a white sheet, leaning halfway towards the sun, gets in the
-    picture: the exposure.
+    The exposure is given by ``white``, the linear light in the picture of a white sheet that leans
+    halfway towards the sun.
     """
 
     azimuth_deg: float
@@ -279,7 +280,7 @@ def _exposure(radiance: F32, sun_klux: F64, white: float) -> float:
 
 
 def _ceiling(rng: np.random.Generator, view: F32) -> F32:
-    """Uneven undersides [H, 2 H] of mean 0, fading towards the horizon."""
+    """Return the unevenness [H, 2 H] of the clouds' undersides, of mean 0."""
     cells = 1024
     f = np.hypot(np.fft.fftfreq(cells)[:, None], np.fft.rfftfreq(cells)[None]) * cells
     white = np.fft.rfft2(rng.standard_normal((cells, cells)))

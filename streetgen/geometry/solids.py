@@ -1,4 +1,4 @@
-"""The simple bodies that streets are made of: rectangles, boxes, tubes, lofts and discs.
+"""Make the simple bodies that streets consist of: rectangles, boxes, tubes, lofts and discs.
 
 Texture coordinates are metres over ``tile_m``, the side of a texture on the wall, so that bricks
 are of one size everywhere.
@@ -28,14 +28,14 @@ BOX_SIDES = np.array(
 )
 """Corners of a box's six sides, anticlockwise from outside, as indices into (low, high)."""
 BOX_AXES = np.array([(0, 1), (0, 1), (0, 2), (0, 2), (1, 2), (1, 2)])
-"""Along which axes each side's texture runs."""
+"""The two axes along which each side's texture runs."""
 WHOLE_TEXTURE = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
 """Texture coordinates of a rectangle whose first corner is the lower left of the picture."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What a body is made of and what it counts as; ``tile_m`` is the side of its texture."""
+    """A body's material and class; ``tile_m`` is the side of its texture, m."""
 
     material: str
     label: Label
@@ -127,7 +127,7 @@ def loft(surface: Surface, sections: ArrayLike, sides: int = 12) -> Mesh:
 
 
 def _ellipses(rings: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Points [N, T, 3] of sections [N, 4] as ``loft`` has them."""
+    """Return the points [N, T, 3] of the sections [N, 4] that ``loft`` takes."""
     height, middle, half_x, half_y = (rings[:, i, None] for i in range(4))
     x, y = middle + half_x * np.cos(turn), half_y * np.sin(turn)
     return np.stack(np.broadcast_arrays(x, y, height), axis=-1)
@@ -154,14 +154,14 @@ def disc(
 
 
 def _frames(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions across a path at each of its points; they turn smoothly where it does."""
+    """Return two directions across a path at each of its points, which turn smoothly with it."""
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     return _frame(along)
 
 
 def _frame(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions [..., 3] that make right-handed systems with the third, ``direction``."""
+    """Return two directions [..., 3] that make right-handed systems with ``direction``."""
     upright = np.abs(direction[..., 2:]) > 0.9
     seen = np.where(upright, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     across = np.cross(seen, direction)

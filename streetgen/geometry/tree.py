@@ -1,4 +1,4 @@
-"""Street trees: a trunk with a flared foot, forking limbs, and leaves along the outermost twigs.
+"""Grow street trees: a trunk with a flared foot, forking limbs, and leaves along the last twigs.
 
 A few trees are grown and each is placed several times, turned and scaled. A leaf is a quad bent
 along its midrib, so that its halves are shaded differently. Bark, leaf and soil textures are
@@ -37,14 +37,14 @@ def tree_materials() -> tuple[Material, ...]:
 
 
 def _bark(rng: np.random.Generator) -> Texture:
-    """Furrows along v."""
+    """Paint bark with furrows along v."""
     furrows = fractal((64, 256), 1.6, rng).repeat(4, axis=0)
     painted = tinted(SIZE, (104, 92, 76)) * (1 - 0.16 * np.clip(furrows, -1.5, 2.5))[..., None]
     return texture(painted + 7 * speckle(SIZE, 1.0, rng)[..., None])
 
 
 def _leaf_shades(rng: np.random.Generator) -> Texture:
-    """Each leaf takes one place of it: yellower along u, darker along v."""
+    """Paint shades of leaves, yellower along u and darker along v; a leaf shows one place."""
     u, v = np.meshgrid(np.linspace(0, 1, SIZE[1]), np.linspace(0, 1, SIZE[0]))
     colour = np.stack([74 + 46 * u, 108 + 22 * u, 40 + 6 * u], axis=2) * (1.2 - 0.5 * v)[..., None]
     return texture((colour * (1 + 0.05 * fractal(SIZE, 2.0, rng))[..., None]).astype(np.float32))
@@ -61,17 +61,18 @@ SOIL = Surface("soil", Label.PAVEMENT)
 GUARD = Surface("tree guard", Label.OBJECT)
 PIT_HALF_M = 0.7
 GROWN = 4
-"""Different trees in a street."""
+"""Number of different trees in a street."""
 SINK_M = 0.05
-"""A trunk begins so far under the ground, that no gap shows."""
+"""Depth under the ground at which a trunk begins, so that no gap shows."""
 
 
 @dataclass(frozen=True)
 class TreeSpecies:
     """The habit of a species.
 
-    ``trunk_m`` to the first limb, ``limbs`` of ``reach_m``, rising by ``rise`` (0 level, 1
-    upright), each forking ``forks`` times into ``split``; ``leaves`` in all, ``leaf_m`` long.
+    The first limb is at the height ``trunk_m``. There are ``limbs`` limbs, which reach ``reach_m``
+    and rise by ``rise`` (0 is level, 1 upright). Each forks ``forks`` times into ``split`` twigs.
+    There are ``leaves`` leaves in all, each ``leaf_m`` long.
     """
 
     trunk_m: float
@@ -94,7 +95,7 @@ KINDS = (
 
 @dataclass(eq=False)
 class Growth:
-    """What has grown so far: tubes of wood, and twigs (start, end) for leaves."""
+    """A tree that grows: its tubes of wood, and its twigs (start, end) for leaves."""
 
     wood: list[Mesh] = field(default_factory=list)
     twigs: list[tuple[F64, F64]] = field(default_factory=list)
@@ -143,7 +144,7 @@ def _branch(
     forks: int,
     rng: np.random.Generator,
 ) -> None:
-    """Grow a branch along a ray (start, direction), and what forks from it."""
+    """Grow a branch along a ray (start, direction), and the branches that fork from it."""
     start, towards = ray
     direction = towards / np.linalg.norm(towards)
     steps = np.linspace(0, 1, 5)[:, None]
@@ -162,7 +163,7 @@ def _branch(
 
 
 def _leaves(kind: TreeSpecies, twigs: list[tuple[F64, F64]], rng: np.random.Generator) -> Mesh:
-    """Two quads a leaf, around points along the twigs."""
+    """Return two quads for each leaf, around points along the twigs."""
     ends = np.array(twigs)
     count = kind.leaves
     twig = ends[rng.integers(0, len(ends), count)]
@@ -196,7 +197,7 @@ def _upright(place: GroundSpot, scale: float) -> F64:
 
 
 def _pit(place: GroundSpot) -> list[Mesh]:
-    """Soil in a frame of iron, level with the pavement."""
+    """Return soil in a frame of iron, level with the pavement."""
     centre, half = np.array([place.x_m, place.y_m]), PIT_HALF_M
     (x0, y0), (x1, y1), z = centre - half, centre + half, place.z_m + 0.012
     soil = quads(SOIL, [[(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]])

@@ -1,4 +1,4 @@
-"""Whole vehicles: cars, vans and delivery trucks that stand on the road, with wheels and cargo box.
+"""Make whole vehicles: cars, vans and delivery trucks, with wheels and cargo box.
 
 In a vehicle's frame x points forward, y to the left and z up; its origin is on the road below the
 middle of its length.
@@ -61,20 +61,20 @@ def cargo(front_m: float, rear_m: float, livery: int, plate: int) -> list[Mesh]:
 
 
 def _wall(start: tuple[float, float], end: tuple[float, float], uv: np.ndarray) -> Mesh:
-    """An upright rectangle; from outside ``start`` is on its right."""
+    """Return an upright rectangle; seen from outside ``start`` is on its right."""
     (x0, y0), (x1, y1) = end, start
     low, high = BOX_LOW_M, BOX_HIGH_M
     return quads(WALL, [[(x1, y1, low), (x0, y0, low), (x0, y0, high), (x1, y1, high)]], uv[None])
 
 
 def _paper_uv(livery: int) -> np.ndarray:
-    """A corner of the firm's board, where there is no letter."""
+    """Return the uv of a corner of the firm's board that has no letters."""
     uv = atlas_uv(len(LIVERIES), livery)
     return np.asarray(uv[:1] + (uv[2] - uv[0]) * 0.02 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
 
 
 def _edges(front_m: float, rear_m: float) -> list[Mesh]:
-    """Rails of metal along all edges of the box."""
+    """Return metal rails along all edges of the box."""
     y, low, high, t = HALF_WIDTH_M, BOX_LOW_M, BOX_HIGH_M, EDGE_M
     found = []
     for z in (low, high):
@@ -91,7 +91,7 @@ def _edges(front_m: float, rear_m: float) -> list[Mesh]:
 
 
 def _below(front_m: float, rear_m: float) -> list[Mesh]:
-    """The frame, a tank, and the guards along the sides."""
+    """Return the frame, a tank, and the guards along the sides."""
     frame = [
         boxes(TRIM, (rear_m + 0.1, y - 0.06, 0.72), (front_m + 0.4, y + 0.06, 1.0))
         for y in (0.42, -0.42)
@@ -107,7 +107,7 @@ def _below(front_m: float, rear_m: float) -> list[Mesh]:
 
 
 def _tail(rear_m: float, plate: int) -> list[Mesh]:
-    """Underrun bar, lamps, the door's gap and its locking bars, number plate."""
+    """Return underrun bar, lamps, the door's gap with its locking bars, and number plate."""
     y = HALF_WIDTH_M
     bar = boxes(TRIM, (rear_m + 0.02, -y, 0.45), (rear_m + 0.1, y, 0.60))
     holder = boxes(TRIM, (rear_m + 0.04, -0.6, 0.55), (rear_m + 0.1, 0.6, 1.0))
@@ -139,11 +139,12 @@ TYRE_PROFILE = (
     *((0.66, 0.42), (0.70, 0.47), (0.80, 0.5), (0.92, 0.49), (0.985, 0.43), (1.0, 0.36)),
     *((1.0, -0.36), (0.985, -0.43), (0.92, -0.49), (0.70, -0.47), (0.66, -0.42)),
 )
-"""Radius over the wheel's, place across over the tyre's width; outside first."""
+"""Points of the profile, outside first: radius as a share of the wheel's, place across as a share
+of the tyre's width."""
 RIM_PROFILE = ((0.67, 0.44), (0.645, 0.445), (0.62, 0.40), (0.60, 0.1))
 RIM_RADIUS, HUB_RADIUS = 0.63, 0.17
 SPOKE_OUT = (0.34, 0.40)
-"""Where the spokes' faces are across the width: at the hub and at the rim."""
+"""Places of the spokes' faces across the width, at the hub and at the rim."""
 
 
 def wheel(radius_m: float, width_m: float, spokes: int, outside: int) -> list[Mesh]:
@@ -192,7 +193,7 @@ def _about_y(pairs: F64, turn: F64) -> F64:
 
 
 def _spokes(radius_m: float, width_m: float, count: int) -> Mesh:
-    """Bars from hub to rim: a face and two flanks each."""
+    """Return bars from hub to rim, each with a face and two flanks."""
     half = 0.055 * radius_m * 10 / max(count, 6)
     inner, outer = (HUB_RADIUS - 0.02) * radius_m, RIM_RADIUS * radius_m
     hub_y, rim_y, back_y = SPOKE_OUT[0] * width_m, SPOKE_OUT[1] * width_m, 0.12 * width_m
@@ -221,14 +222,14 @@ TRUCK_LENGTH_M = 7.0
 TRUCK_REAR_AXLE_M = 5.35
 KINDS = ("hatchback", "saloon", "estate", "suv", "van", "truck")
 SHARES = (0.34, 0.20, 0.16, 0.18, 0.09, 0.03)
-"""How common each kind is in a European street."""
+"""The share of each kind in a European street."""
 PAINT_SHARES = (0.19, 0.17, 0.21, 0.17, 0.08, 0.05, 0.06, 0.03, 0.02, 0.02)
 WHEEL_INSET_M = 0.035
 
 
 @dataclass(frozen=True)
 class VehicleLooks:
-    """What a vehicle looks like: one of ``KINDS``, its paint, plate and, on a truck, its firm."""
+    """A vehicle's kind (of ``KINDS``), paint, number plate, wheels and, on a truck, its firm."""
 
     kind: str
     paint: str
@@ -246,7 +247,7 @@ class VehicleLooks:
 
     @property
     def length_m(self) -> float:
-        """From nose to tail."""
+        """Length from nose to tail."""
         return TRUCK_LENGTH_M if self.kind == "truck" else BODIES[self.kind].length_m
 
 

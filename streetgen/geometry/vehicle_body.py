@@ -1,4 +1,4 @@
-"""The body of a vehicle: the lofted surface, its two ends and its underside, cut into materials.
+"""Make a vehicle's body: the lofted surface, its ends and its underside, cut by material.
 
 All parts share one set of smooth normals, so that no edge shows where paint meets glass.
 """
@@ -25,7 +25,7 @@ from streetgen.geometry.vehicle_shape import BodyShape
 __all__ = ["BodySurface", "body", "surface_of"]
 
 COLUMNS = 16
-"""Of nose and tail, across."""
+"""Number of columns across nose and tail."""
 PAINT, GLASS, TRIM, SEAM, LAMP, TAIL_LAMP, GRILLE, BRIGHT, DRL = range(9)
 Codes = NDArray[np.int8]
 
@@ -40,7 +40,7 @@ class SurfaceGrid:
 
 @dataclass(frozen=True, eq=False)
 class BodySurface:
-    """The loft and its two ends, with the places that fittings are fixed to."""
+    """The loft and its two ends, with the places for fittings."""
 
     sides: Lofted
     nose: SurfaceGrid
@@ -94,7 +94,7 @@ def body(shape: BodyShape, surface: BodySurface, paint: str) -> list[Mesh]:
 
 
 def _side_codes(shape: BodyShape, surface: Lofted) -> Codes:
-    """Codes of the lofted quads; the section is mirrored at its middle."""
+    """Return the codes of the lofted quads; the section is mirrored at its middle."""
     at = 0.5 * (surface.at[1:] + surface.at[:-1])
     half = np.full((len(at), Rows.MIDDLE), PAINT, np.int8)
     glazed = slice(Rows.GLASS_LOW, Rows.GLASS_HIGH)
@@ -122,7 +122,7 @@ def _side_codes(shape: BodyShape, surface: Lofted) -> Codes:
 
 
 def _end(shape: BodyShape, outline: F64, nose: bool) -> SurfaceGrid:
-    """A face that closes the outline [2 M + 1, 3]: rows by height, columns from side to side."""
+    """Return a face that closes the outline [2 M + 1, 3]; columns run from side to side."""
     rows = Rows.MIDDLE + 1
     start, end = outline[:rows], outline[: rows - 2 : -1]
     share = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, COLUMNS + 1))
@@ -146,7 +146,7 @@ def _end(shape: BodyShape, outline: F64, nose: bool) -> SurfaceGrid:
 
 
 def _cut(patches: list[SurfaceGrid], names: dict[int, str]) -> list[Mesh]:
-    """One mesh a material, with the normals of the whole surface."""
+    """Return a mesh for each material, with the normals of the whole surface."""
     points = np.concatenate([patch.points.reshape(-1, 3) for patch in patches])
     starts = np.cumsum([0] + [patch.points[..., 0].size for patch in patches[:-1]])
     quads = [_quads(p, start) for p, start in zip(patches, starts.tolist(), strict=True)]
@@ -172,7 +172,7 @@ def _cut(patches: list[SurfaceGrid], names: dict[int, str]) -> list[Mesh]:
 
 
 def _quads(patch: SurfaceGrid, start: int) -> I32:
-    """Corner numbers [Q, 4], anticlockwise from outside."""
+    """Return corner numbers [Q, 4], anticlockwise seen from outside."""
     count, width = patch.points.shape[:2]
     first = np.arange(count - 1)[:, None] * width + np.arange(width - 1)[None]
     corners = [first, first + 1, first + width + 1, first + width]
@@ -180,7 +180,7 @@ def _quads(patch: SurfaceGrid, start: int) -> I32:
 
 
 def _smooth_normals(points: F64, faces: I32) -> F64:
-    """Area-weighted means at each place; points at the same place count as one."""
+    """Return area-weighted mean normals; points at the same place share one."""
     _, place = np.unique(np.round(points, 4), axis=0, return_inverse=True)
     a, b, c = (points[faces[:, i]] for i in range(3))
     area = np.cross(b - a, c - a)
@@ -192,7 +192,7 @@ def _smooth_normals(points: F64, faces: I32) -> F64:
 
 
 def _underside(shape: BodyShape, surface: Lofted) -> Mesh:
-    """The floor, dark, with a tunnel over each pair of wheels."""
+    """Return the dark floor, with a tunnel over each pair of wheels."""
     right, left = surface.points[:, 0], surface.points[:, -1]
     points = np.stack([right, left], axis=1)
     points[..., 2] = np.minimum(points[..., 2], sill_line(shape, surface.at)[:, None])

@@ -1,4 +1,4 @@
-"""Cross-sections of a vehicle body at its stations, and the surface lofted through them.
+"""Loft a surface through the cross-sections of a vehicle body at its stations.
 
 A half section runs from the sill up over the belt and the roof's edge to the middle of the top; its
 rows mean the same at every station, so that windows, lamps and mouldings end exactly on rows and
@@ -17,7 +17,7 @@ from streetgen.geometry.vehicle_shape import BodyShape, curve
 __all__ = ["END_M", "FILLET_RINGS", "SEAM_M", "Lofted", "Rows", "lofted", "sill_line", "stations"]
 
 END_M = 0.10
-"""The rounded edge between sides and nose or tail."""
+"""Radius of the rounded edge between the sides and nose or tail."""
 FILLET_RINGS = 4
 SEAM_M = 0.008
 CROWN_M = 0.05
@@ -96,7 +96,7 @@ def lofted(shape: BodyShape) -> Lofted:
 
 
 def _half_section(shape: BodyShape, station: float) -> F64:
-    """Points [M + 1, 2] as (half width, height) of the section at a station."""
+    """Return the section at a station as points [M + 1, 2] of (half width, height)."""
     low = float(sill_line(shape, np.array(station)))
     top = float(curve(shape.top, station))
     widest = 0.5 * shape.width_m * float(curve(shape.width, station))
@@ -120,13 +120,13 @@ def _half_section(shape: BodyShape, station: float) -> F64:
 
 
 def _bulge(share: F64) -> F64:
-    """Half width over the height from sill to belt: tucked in below, a shoulder line above."""
+    """Return the half width over the height from sill to belt, with a shoulder line."""
     knots = ((-0.3, 0.93), (0.0, 0.955), (0.2, 0.985), (0.45, 0.998), (0.62, 1.0), (0.70, 0.984))
     return curve((*knots, (0.85, 0.975), (1.0, 0.955)), share)
 
 
 def _rounded(section: F64) -> tuple[F64, F64]:
-    """Rings [R, M + 1, 2] that close in on a face, and how far each stands out [R]."""
+    """Return rings [R, M + 1, 2] that close in on a face, and how far each stands out [R]."""
     turn = np.linspace(0, np.pi / 2, FILLET_RINGS + 1)[1:]
     inwards = END_M * (1 - np.cos(turn))
     middle = 0.5 * (section[0, 1] + section[-1, 1])
@@ -138,7 +138,7 @@ def _rounded(section: F64) -> tuple[F64, F64]:
 
 
 def _bowed(shape: BodyShape, points: F64) -> F64:
-    """Bend nose and tail out in the middle and at bumper height; from stations to forward x."""
+    """Turn stations into forward x, and bend nose and tail out in the middle."""
     station, y, z = np.moveaxis(points, 2, 0)
     across = 1 - (y / (0.5 * shape.width_m)) ** 2
     bumper = np.exp(-(((z - 0.2 - 0.5 * shape.sill_m) / 0.22) ** 2))

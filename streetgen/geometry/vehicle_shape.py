@@ -1,4 +1,4 @@
-"""The shapes of vehicle bodies, as side and plan views give them: curves over the length.
+"""Describe vehicle bodies by curves over their length, as side and plan views give them.
 
 Stations run from the nose (0) to the tail (``length_m``), heights from the road, both in metres.
 Between the knots curves are monotone cubics (Fritsch and Butland 1984), so that they do not
@@ -26,13 +26,13 @@ Knots = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class BodyShape:
-    """One body.
+    """The shape of one body.
 
-    ``top``: the middle line over bonnet, windscreen, roof and tail. ``belt``: the lower edge of the
-    side windows. ``width``: half the width as a share of the widest. ``axles_m`` stations.
-    ``windscreen`` and ``rear_window``: from where to where the top is glass. ``side_windows``:
-    the same along the sides. ``doors``: stations of the gaps. ``bow_m``: how far nose and tail
-    stand out in the middle. ``cladding``: whether sills and bumpers are of dark plastic.
+    ``top`` is the middle line over bonnet, windscreen, roof and tail, ``belt`` the lower edge of
+    the side windows, ``width`` half the width as a share of the widest. ``axles_m`` are stations.
+    ``windscreen``, ``rear_window`` and ``side_windows`` are ranges of stations with glass,
+    ``doors`` the stations of the gaps. ``bow_m`` is how far nose and tail stand out in the middle.
+    With ``cladding`` sills and bumpers are of dark plastic.
     """
 
     length_m: float

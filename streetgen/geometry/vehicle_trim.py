@@ -1,4 +1,4 @@
-"""What is fixed to a vehicle's body, and what vehicles are made of.
+"""Make the fittings of a vehicle's body, and the materials of vehicles.
 
 Fittings are mirrors, handles, number plates, gaps between panels, lamp optics and wipers. Paints
 are common colours of European cars, as linear reflectances.
@@ -101,7 +101,7 @@ def number_plate(centre: F64, forward: float, text: int) -> Mesh:
 
 
 def _ribbon(path: F64, outwards: F64) -> Mesh:
-    """A dark line of ``GAP_M`` along a path [N, 3] on a surface that looks ``outwards`` [N, 3]."""
+    """Return a dark line of ``GAP_M`` along a path [N, 3] over normals ``outwards`` [N, 3]."""
     along = np.gradient(path, axis=0)
     across = np.cross(outwards, along)
     across *= GAP_M / 2 / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
@@ -111,14 +111,14 @@ def _ribbon(path: F64, outwards: F64) -> Mesh:
 
 
 def _bonnet_gap(shape: BodyShape, surface: BodySurface, side: int) -> Mesh:
-    """From the lamps along the edge of the bonnet to the windscreen."""
+    """Return the gap from the lamps along the edge of the bonnet to the windscreen."""
     last = surface.column(shape.windscreen[0] - 0.08)
     columns = np.arange(FILLET_RINGS, last + 1, dtype=np.int32)
     return _ribbon(*surface.path(columns, Rows.EDGE, side))
 
 
 def _tail_gaps(shape: BodyShape, surface: BodySurface) -> list[Mesh]:
-    """The upper edge of the bumper, and the sides of the door above it."""
+    """Return the upper edge of the bumper, and the sides of the door above it."""
     tail = surface.tail
     level = tail.points[Rows.GRILLE_HIGH]
     back = np.broadcast_to([-1.0, 0.0, 0.0], level.shape)
@@ -143,7 +143,7 @@ def _mirror(shape: BodyShape, surface: BodySurface, paint: str, side: int) -> li
 
 
 def _ellipsoid(made_of: Surface, middle: F64, radii: F64) -> Mesh:
-    """A smooth ball stretched along the axes; at 0.65 of its length it is cut flat behind."""
+    """Return an ellipsoid that is cut flat behind at 0.65 of its length."""
     away = np.linspace(0.03, np.pi - 0.03, 9)[:, None]
     turn = np.linspace(0, 2 * np.pi, 15)[None]
     across = np.sin(away)
@@ -165,7 +165,7 @@ def _ellipsoid(made_of: Surface, middle: F64, radii: F64) -> Mesh:
 
 
 def _handles(shape: BodyShape, surface: BodySurface, side: int) -> list[Mesh]:
-    """A bar in front of the rear edge of each door."""
+    """Return a bar in front of the rear edge of each door."""
     found = []
     for door in shape.doors[1:]:
         place = surface.point(door - 0.17, Rows.BELT - 2, side)
@@ -175,7 +175,7 @@ def _handles(shape: BodyShape, surface: BodySurface, side: int) -> list[Mesh]:
 
 
 def _lamp_optics(surface: BodySurface, side: int) -> list[Mesh]:
-    """Two bright lenses in each headlamp."""
+    """Return two bright lenses in each headlamp."""
     nose = surface.nose
     found = []
     middle = (nose.points.shape[1] - 1) // 2
@@ -205,7 +205,7 @@ def _plates(shape: BodyShape, surface: BodySurface, text: int) -> list[Mesh]:
 
 
 def _wipers(shape: BodyShape, surface: BodySurface) -> Mesh:
-    """Two blades at rest along the lower edge of the windscreen."""
+    """Return two blades at rest along the lower edge of the windscreen."""
     station = shape.windscreen[0] + 0.06
     row = Rows.SCREEN + 1
     start, end = (surface.point(station, row, side) for side in (1, -1))

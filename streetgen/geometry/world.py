@@ -1,4 +1,4 @@
-"""The whole street: what stands in it, what moves in it, and the light over it.
+"""Hold the whole street: the things that stand or move in it, and the light over it.
 
 * A module of ``streetgen.geometry`` that adds something offers a function
   ``(layout, rng) -> StreetPart`` (``tree.trees``, ``furniture.signs``, ``road.road``). The layout
@@ -55,7 +55,7 @@ class Sky:
 
 @dataclass(frozen=True, eq=False)
 class Mover:
-    """Something that moves as a whole: ``world_from_mover(time_s)`` gives its 4x4 matrix."""
+    """Meshes that move as a whole: ``world_from_mover(time_s)`` returns their 4x4 matrix."""
 
     meshes: tuple[Mesh, ...]
     world_from_mover: Callable[[float], F64]
@@ -74,7 +74,7 @@ class StreetPart:
 class World:
     """A street to render. Every material that a mesh names is in ``materials``.
 
-    ``sky`` is the light at time 0; where it changes, ``sky_at(time_s)`` gives that of any time.
+    ``sky`` is the light at time 0; if it changes, ``sky_at(time_s)`` returns that of any time.
     """
 
     layout: Layout

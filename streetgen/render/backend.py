@@ -1,11 +1,12 @@
-"""Which Mitsuba runs: CUDA's on an NVIDIA GPU, else LLVM's, else the slow scalar variant.
+"""Choose the variant of Mitsuba: CUDA on an NVIDIA GPU, else LLVM, else the slow scalar one.
 
-CUDA's variant needs the driver alone, with its OptiX. A variant that does not work may end the
-process that tries it, and an abort is no exception, so each is tried in a process of its own.
+CUDA's variant needs nothing but the driver with its OptiX. A variant that does not work may abort
+the process that tries it, so each is tried in a process of its own.
 
-Mitsuba is told by ``DRJIT_LIBLLVM_PATH`` which LLVM to load, and the wrong one ends the process: of
-Debian's, 14 is refused, 15 and 16 abort in code generation ("Cannot select", Mitsuba 3.9.1), 19
-works. So versions below ``OLDEST_LLVM`` are passed over, and newer ones are tried newest first.
+``DRJIT_LIBLLVM_PATH`` tells Mitsuba which LLVM to load, and the wrong one ends the process. Of
+Debian's versions 14 is refused, 15 and 16 abort in code generation ("Cannot select", Mitsuba
+3.9.1), and 19 works. So versions below ``OLDEST_LLVM`` are passed over, and newer ones are tried
+newest first.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from rfcore.errors import BackendUnavailable
 __all__ = ["CUDA", "Backend", "Variant", "chosen_backend", "load_mitsuba"]
 
 Variant = Literal["auto", "cuda", "llvm", "scalar"]
-"""What renders; auto: the first of the others that works."""
+"""Names of the variants; auto is the first of the others that works."""
 
 FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
@@ -57,7 +58,7 @@ class Backend:
 
     @property
     def vectorised(self) -> bool:
-        """Whether rays are traced many at a time."""
+        """True if many rays are traced at a time."""
         return self.variant != "scalar_rgb"
 
 

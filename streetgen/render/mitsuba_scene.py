@@ -1,4 +1,4 @@
-"""A world as a Mitsuba scene: shapes, the sky as environment map, and reflectance models.
+"""Turn a world into a Mitsuba scene: shapes, reflectance models, and the sky as environment map.
 
 There is one shape for each material and label, never instances: 83 instances of a tree made a frame
 seven times slower in the LLVM variant than the same triangles baked into one mesh.
@@ -25,7 +25,7 @@ __all__ = ["MitsubaScene", "environment", "surface", "with_sun"]
 
 
 ROWS = 512
-"""Of the map that is handed over: 0.35 degrees a pixel, so that the sun is a few of them."""
+"""Rows of the environment map: 0.35 degrees a pixel, so that the sun covers a few of them."""
 LEAST_SUN_PX = 1.5
 
 
@@ -65,7 +65,7 @@ def with_sun(sky: Sky) -> F32:
 
 
 def _directions(rows: int) -> tuple[F64, F64]:
-    """Where each pixel of a map looks [H, 2 H, 3], and the solid angle that it covers [H, 2 H]."""
+    """Return the direction of each pixel of a map [H, 2 H, 3] and its solid angle [H, 2 H]."""
     down = (np.arange(rows) + 0.5) / rows * np.pi
     round_ = (np.arange(2 * rows) + 0.5) / rows * np.pi
     theta, phi = np.meshgrid(down, round_, indexing="ij")
@@ -76,7 +76,7 @@ def _directions(rows: int) -> tuple[F64, F64]:
 
 
 MATT = 0.85
-"""From this roughness on a dielectric's highlight is not worth its samples."""
+"""Roughness from which on a dielectric's highlight is not worth its samples."""
 GLASS_INDEX = 1.5
 
 
@@ -118,7 +118,7 @@ def _roughness(mi: Any, material: Material) -> Any:
 
 
 class MitsubaScene:
-    """A loaded scene. ``at`` moves what moves; ``labels`` says what each shape counts as."""
+    """A loaded scene. ``at`` moves its movers; ``labels`` has the class of each shape."""
 
     def __init__(self, mi: Any, world: World) -> None:
         self._mi = mi
@@ -165,7 +165,7 @@ class MitsubaScene:
 
 
 def _used(world: World) -> Mapping[str, Material]:
-    """The materials that some mesh names, so that no other is loaded."""
+    """Return the materials that some mesh names, so that no other is loaded."""
     moving = (mesh for mover in world.movers for mesh in mover.meshes)
     names = {mesh.material for mesh in (*world.meshes, *moving)}
     return {name: m for name, m in world.materials.items() if name in names}

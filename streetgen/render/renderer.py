@@ -1,4 +1,4 @@
-"""One frame of a world: path-traced, denoised, with depth and classes.
+"""Render a frame of a world: path-traced, denoised, with depth and classes.
 
 Mitsuba's own depth is a distance along rays through random places of a pixel. Here one ray goes
 through each pixel's centre, and its distance times the cosine to the optical axis is z.
@@ -38,7 +38,7 @@ def cast_pixel_rays(
 
 
 def _directions(k: Intrinsics) -> tuple[F64, F64]:
-    """Unit vectors through the pixel centres [H W, 3] and how long they are at z = 1."""
+    """Return unit vectors through the pixel centres [H W, 3], and the rays' lengths at z = 1."""
     u, v = np.meshgrid(np.arange(k.width_px) + 0.5, np.arange(k.height_px) + 0.5)
     rays = np.stack(
         [(u - k.cx_px) / k.fx_px, (v - k.cy_px) / k.fy_px, np.ones_like(u)], axis=-1
@@ -79,9 +79,11 @@ def _cast_one_by_one(
 
 
 PATH_DEPTH = 3
-"""2 loses 8 % of the light and what panes mirror; 5 adds 1.7 % and takes twice as long."""
+"""Length of light paths. 2 loses 8 % of the light and the mirror images in panes; 5 adds 1.7 % of
+light and takes twice as long."""
 GUIDE_SAMPLES = 16
-"""They take a twentieth of a frame of 16 samples; with 4 the denoised picture is 0.5 dB worse."""
+"""Samples of albedo and normals. They take a twentieth of a frame of 16 samples; with 4 the
+denoised picture is 0.5 dB worse."""
 NEAR_M, FAR_M = 0.05, 1000.0
 
 
@@ -89,7 +91,8 @@ NEAR_M, FAR_M = 0.05, 1000.0
 class Sampling:
     """``samples`` a pixel, a square number for stratification, and the ``seed`` that places them.
 
-    The seed is one for all frames: what does not move is then the same in every frame, to the bit.
+    All frames have the same seed, so that what does not move is the same in every frame, to the
+    bit.
     """
 
     samples: int = 16
@@ -102,8 +105,10 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
-    """``colour`` float32 [H, W, 3], linear, 1 is white; ``depth_m`` float32 [H, W], z, infinite in
-    the sky; ``labels`` uint8 [H, W] of ``streetgen.geometry.mesh.Label``.
+    """A rendered frame.
+
+    ``colour`` is linear, float32 [H, W, 3], where 1 is white. ``depth_m`` is z, float32 [H, W],
+    infinite in the sky. ``labels`` are uint8 [H, W] of ``streetgen.classes.Label``.
     """
 
     colour: F32
@@ -157,7 +162,7 @@ class PathTracer:
 
 
 def _sensor(mi: Any, camera: Camera) -> dict[str, Any]:
-    """Mitsuba's cameras look along z with x to the left and y up."""
+    """Return Mitsuba's sensor; its cameras look along z with x to the left and y up."""
     k = camera.intrinsics
     world_from_cam = np.eye(4)
     world_from_cam[:3, :3] = camera.world_from_cam.rotation_matrix()
