@@ -1,8 +1,8 @@
-"""Who may see what, and who is let in no longer: one file of the server, read again on change.
+"""Permissions of consumers and the list of revoked certificates: one file, read again on change.
 
-A certificate says who somebody is and in which role; what a consumer may see stands in this file,
-not in the certificate, so that it can be changed in a moment, without issuing anything anew, and
-for streams that are open. ``--access FILE`` (TOML)::
+A certificate states an identity and its role. What a consumer may see is in this file instead of
+the certificate, so that it can be changed in a moment, without issuing certificates, and for
+streams that are open. ``--access FILE`` (TOML)::
 
     revoked = ["spiffe://rfedge/vehicle/cav-7", "serial:0x5a31"]
 
@@ -15,7 +15,7 @@ for streams that are open. ``--access FILE`` (TOML)::
     [consumers.auditor]
     all = true
 
-Without the file consumers see everything; with it, one that it does not name sees nothing. A
+Without the file consumers see everything; with it, a consumer that it does not name sees nothing. A
 vehicle sees its own pictures, an operator all. Fields are for vehicles and operators, and for
 consumers those of the tiles they may see. A tile is seen by its field: two tiles of one server that
 share a field are seen together.
@@ -40,7 +40,7 @@ __all__ = ["EVERYTHING", "AccessList", "Grant", "read_access"]
 
 @dataclass(frozen=True)
 class Grant:
-    """What somebody may see: everything, or pictures of these vehicles and against these tiles."""
+    """Permission to see everything, or pictures of some vehicles and pictures in some tiles."""
 
     everything: bool = False
     vehicles: frozenset[str] = frozenset()

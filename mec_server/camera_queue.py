@@ -1,10 +1,9 @@
-"""The cameras of one session: frames in order, one being decoded per camera, and credits.
+"""The cameras of one session: frames in order, at most one being decoded per camera, and credits.
 
 Sans-IO bookkeeping. Frames enter with ``admit``, leave to the decoder with ``start`` and end in
 ``succeed``, ``fail`` or ``refuse``; each gets exactly one answer. The epoch and the next expected
-sequence move only when a frame was reconstructed, so that a damaged frame cannot move them.
-
-``check`` judges the order of frames and their CRC, before any work is spent on them.
+sequence move only when a frame was reconstructed, so that a damaged frame cannot move them. The
+order of frames is checked here, before any work is spent on them.
 """
 
 from __future__ import annotations
@@ -31,7 +30,8 @@ MAX_GAP = 64
 """Sequences that may be missing at once; credits keep an honest sender far below it."""
 
 MAX_EPOCH_STEP = 1 << 16
-"""How far an epoch may lead the last one: a flipped high bit must not make all that follow stale"""
+"""Largest step from one epoch to the next: a flipped high bit must not make all later ones
+stale."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class CameraQueue:
 
     @property
     def granted(self) -> int:
-        """How many frames the vehicle may have sent in all."""
+        """Number of frames that the vehicle may have sent in all."""
         return self.answered + self._window
 
     @property

@@ -29,8 +29,9 @@ __all__ = [
 
 
 class DecoderKind(StrEnum):
-    """Where packets are decoded (``rfcore.confinement``); AUTO: in the server if only this machine
-    can reach it, otherwise under bubblewrap where that works, otherwise under Landlock."""
+    """The process that decodes packets (``rfcore.confinement``). AUTO decodes in the server if only
+    this machine can reach it, otherwise under bubblewrap where that works, otherwise under
+    Landlock."""
 
     AUTO = "auto"
     IN_PROCESS = "in-process"
@@ -41,11 +42,11 @@ class DecoderKind(StrEnum):
 
 @dataclass(frozen=True)
 class SessionLimits:
-    """Deadlines in seconds and the window of one session.
+    """Deadlines and the window of one session.
 
-    ``window_frames``: frames of one camera in flight or being decoded; two keep the link busy
-    while one is decoded, more would only add delay. ``stalled_s``: a peer that took nothing of what
-    is sent to it for so long is let go.
+    ``window_frames``: frames of one camera in flight or being decoded; two keep the link busy while
+    one is decoded, more would only add delay. ``stalled_s``: a peer that took no answer for this
+    long is disconnected.
     """
 
     hello_s: float = 5.0
@@ -63,12 +64,12 @@ class SessionLimits:
 
 @dataclass(frozen=True)
 class IdentityBudget:
-    """What one identity (certificate) may use at most, over all its connections: far above what a
-    correct one uses, far below what would starve the others."""
+    """The most that one identity (certificate) may use over all its connections: far above the
+    needs of a correct one, far below what would starve the others."""
 
     share: Annotated[float, arg(name="identity-share")] = 0.5
     """Share of the server's budgets, and of the workers' time when others want it, that one
-    identity may have, whatever the numbers below say."""
+    identity may have, whatever the limits below are."""
     streams: Annotated[int, arg(name="identity-streams")] = 8
     """Streams of frames."""
     decoders: Annotated[int, arg(name="identity-decoders")] = 40
@@ -81,14 +82,14 @@ class IdentityBudget:
     rpcs: Annotated[int, arg(name="identity-rpcs")] = 32
     """Calls in progress, of any kind."""
     calls_per_s: Annotated[float, arg(name="identity-calls-per-s")] = 50.0
-    """Calls it may begin."""
+    """Calls that it may begin in a second."""
     messages_per_s: Annotated[float, arg(name="identity-messages-per-s")] = 1200.0
-    """Messages it may send on its streams: frames, and what was to be one."""
+    """Messages that it may send on its streams in a second, parsable or not."""
     bytes_per_s: Annotated[float, arg(name="identity-bytes-per-s")] = 32e6
-    """Bytes these may have."""
+    """Bytes that these messages may have in a second."""
     rejected_workers: Annotated[float, arg(name="identity-rejected-workers")] = 0.2
-    """Workers that those of its frames may keep busy, when others want them, that are rejected
-    after they were rendered. A correct vehicle whose packets are lost takes a quarter of it."""
+    """Workers that its rejected frames may keep busy while others want them. A correct vehicle
+    whose packets are lost uses a quarter of it."""
 
     def __post_init__(self) -> None:
         if not 0 < self.share <= 1:
@@ -105,24 +106,24 @@ class IdentityBudget:
 
 @dataclass(frozen=True)
 class ServerBudget:
-    """What all identities together may use."""
+    """The most that all identities together may use."""
 
     streams: Annotated[int, arg(name="max-streams")] = 256
-    """How many streams of vehicles may be open at once."""
+    """Streams of vehicles that may be open at once."""
     decoders: Annotated[int, arg(name="max-decoders")] = 0
-    """How many decoders there may be. 0: as many as fit into memory, 48 MiB each."""
+    """Decoders that may be open at once. 0: as many as fit into memory, 48 MiB each."""
     fetches: Annotated[int, arg(name="max-fetches")] = 16
-    """How many fields may be sent at once."""
+    """Fields that may be sent at once."""
     watches: Annotated[int, arg(name="max-consumers")] = 8
-    """How many consumers may watch at once."""
+    """Consumers that may watch at once."""
     rpcs: Annotated[int, arg(name="max-rpcs")] = 512
-    """How many calls may be in progress, of any kind."""
+    """Calls of any kind that may be in progress."""
     calls_per_s: Annotated[float, arg(name="max-calls-per-s")] = 1000.0
-    """How many calls may begin."""
+    """Calls that may begin in a second."""
     messages_per_s: Annotated[float, arg(name="max-messages-per-s")] = 20_000.0
-    """How many messages may come on streams of vehicles."""
+    """Messages that vehicles may send in a second."""
     bytes_per_s: Annotated[float, arg(name="max-bytes-per-s")] = 1e9
-    """How many bytes these may have."""
+    """Bytes that these messages may have in a second."""
 
     def __post_init__(self) -> None:
         for name in ("streams", "fetches", "rpcs"):
@@ -141,13 +142,13 @@ def _check_budget(name: str, value: float, highest: float) -> None:
 
 @dataclass(frozen=True)
 class AdmissionLimits:
-    """How much of the workers' time is promised to vehicles (``mec_server.ledger.promises``)."""
+    """The workers' time that is promised to vehicles (``mec_server.ledger.promises``)."""
 
     load: Annotated[float, arg(name="max-load")] = 0.8
     """Share of the workers' time that vehicles are promised; beyond it they get a lower rate, or
     are asked to come again. 0: every vehicle is let in."""
     lowest_hz: Annotated[float, arg(name="lowest-rate")] = 2.0
-    """Lowest rate in pictures per second; a vehicle that can be given less is refused."""
+    """Lowest rate in pictures per second; a vehicle for which only less is left is refused."""
     render_deadline_s: Annotated[float, arg(name="render-deadline")] = 5.0
     """Seconds from a frame's arrival to the expected end of its decoding; one that would take
     longer is refused unrendered. After 5 s its vehicle has given it up."""
@@ -166,16 +167,16 @@ class AdmissionLimits:
 
 @dataclass(frozen=True)
 class RecordSettings:
-    """What is kept on disk of what vehicles send that allow it (`cav-agent --allow-recording`)."""
+    """Recording of what vehicles send, as far as they allow it (`cav-agent --allow-recording`)."""
 
     folder: Annotated[Path | None, arg(name="record", metavar="FOLDER")] = None
-    """Keep pictures, poses and times as datasets: FOLDER/VEHICLE/CAMERA/PART (docs/how-to/data.md);
-    nothing without it."""
+    """Record pictures, poses and times as datasets: FOLDER/VEHICLE/CAMERA/PART
+    (docs/how-to/data.md). Without it nothing is recorded."""
     max_gb: Annotated[float, arg(name="record-max-gb")] = 10.0
-    """What all recordings in the folder may take, in 10^9 bytes; the tile and the vehicle with most
-    give their oldest parts first."""
+    """Size limit of all recordings in the folder, in 10^9 bytes; the tile and the vehicle with most
+    lose their oldest parts first."""
     max_age_h: Annotated[float, arg(name="record-max-age-h")] = 72.0
-    """After how many hours a part is deleted."""
+    """Age at which a part is deleted, in hours."""
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.max_gb <= 1e6:
@@ -186,7 +187,7 @@ class RecordSettings:
 
 @dataclass(frozen=True)
 class LearnSettings:
-    """What is learnt of recordings: other lights of the tiles, and what changed on the street."""
+    """Learning from recordings: other lights of the tiles, and changes of the street."""
 
     on: Annotated[bool, arg(name="learn")] = False
     """Learn from what is recorded (--record), in a process of its own while a processor is idle,
@@ -195,15 +196,17 @@ class LearnSettings:
     """Another light as colours (a layer on the tile's field), as delta (all parameters, as their
     difference to the tile's field) or as all (a field of its own)."""
     min_identities: Annotated[int, arg(name="learn-min-identities")] = 2
-    """From fewer vehicles nothing is learnt."""
+    """Least number of vehicles to learn from."""
     cpu_s_per_h: Annotated[float, arg(name="learn-cpu-s-per-h")] = 900.0
-    """Seconds of one core that learning about one tile may take in an hour."""
+    """CPU time that learning about one tile may take in an hour, in seconds of one core."""
     max_gb: Annotated[float, arg(name="learn-max-gb")] = 1.0
-    """What all learnt archives may take, in 10^9 bytes; the oldest that are not current go."""
+    """Size limit of all learnt archives, in 10^9 bytes; the oldest that are not current are
+    deleted."""
     max_age_h: Annotated[float, arg(name="learn-max-age-h")] = 24.0
-    """Recordings older than so many hours are not learnt from."""
+    """Greatest age of recordings to learn from, in hours."""
     quiet_s: Annotated[float, arg(name="learn-quiet-s")] = 20.0
-    """A pass is over, and is learnt from, when nothing was recorded of it for so many seconds."""
+    """A pass is over, and is learnt from, after nothing was recorded of it for this many
+    seconds."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.min_identities <= 1000:
@@ -220,14 +223,13 @@ class LearnSettings:
 
 @dataclass(frozen=True)
 class NatsSettings:
-    """Where the pictures of several servers come together (docs/how-to/servers.md); nowhere without
-    it."""
+    """One twin of several servers over NATS (docs/how-to/servers.md)."""
 
     urls: Annotated[str | None, arg(name="nats", metavar="URL[,URL]")] = None
     """Servers of NATS, nats://HOST:PORT or tls://HOST:PORT: publish pictures of vehicles and where
     they are, and exchange fields with the other servers there."""
     name: Annotated[str, arg(name="nats-name", metavar="NAME")] = ""
-    """What this server is called there; default: its host's name and its port."""
+    """Name of this server there; default: its host's name and its port."""
     login: Annotated[Path | None, arg(name="nats-login", metavar="FILE")] = None
     """File of one line, USER:PASSWORD or a token."""
     authority: Annotated[Path | None, arg(name="nats-ca", metavar="FILE.pem")] = None
@@ -273,12 +275,12 @@ class ServerConfig:
     learn: LearnSettings = LearnSettings()
     nats: NatsSettings = NatsSettings()
     workers: int | None = None
-    """Frames reconstructed at once; by itself as many as there are processors, or as a container's
-    limit grants."""
+    """Frames reconstructed at once; default: the number of processors, or of those that a
+    container's limit grants."""
     decoder: DecoderKind = DecoderKind.AUTO
-    """Where packets are decoded. bubblewrap: in sandboxes, one a camera. landlock: in processes
-    that give up files, network and most system calls. child: in processes with limits alone.
-    in-process: in the server. auto: in-process if only this machine can reach the server, else
+    """The process that decodes packets. bubblewrap: sandboxes, one for each camera. landlock:
+    processes that give up files, network and most system calls. child: processes with limits only.
+    in-process: the server. auto: in-process if only this machine can reach the server, else
     bubblewrap where it works, else landlock; never less."""
     sandbox_as_root: bool = False
     """Decode in a sandbox though the server runs as root; refused otherwise."""
@@ -290,8 +292,8 @@ class ServerConfig:
     metrics: MetricsSettings = MetricsSettings()
     transport: TransportSettings = TransportSettings()
     notices: bool = True
-    """Tell vehicles that ask (`cav-agent --notices`) what others see ahead of them; costs nothing
-    while none does (docs/how-to/twin.md)."""
+    """Warn vehicles that ask (`cav-agent --notices`) of what others see ahead of them; costs
+    nothing while none does (docs/how-to/twin.md)."""
     access: Path | None = None
     """File that says what consumers may see and which certificates are revoked (TOML, see
     docs/how-to/operations.md); read again when it changes. Without it consumers see everything."""
@@ -299,18 +301,18 @@ class ServerConfig:
     """Proxies (certificates of spiffe://rfedge/proxy/NAME) whose x-forwarded-client-cert says which
     vehicle a call is of (docs/how-to/servers.md); from everybody else the header means nothing."""
     address_connections: int = 256
-    """Connections that one address (of IPv6, one /64) may hold, whoever is behind them; newer ones
-    are closed within a quarter of a second. 0: any number."""
+    """Connections that one address (for IPv6, one /64) may hold, whoever is behind it; newer ones
+    are closed within a quarter of a second. 0: no limit."""
     identity_connections: int = 32
     """Connections that one certificate's identity may hold; newer ones are closed, and their
-    address may open none for ten seconds. 0: any number."""
+    address may open none for ten seconds. 0: no limit."""
     max_connection_age_s: float = 86_400.0
-    """After how many seconds a connection is renewed, open streams in it after half a minute more;
-    0: never."""
+    """Age at which a connection is renewed, in seconds; its streams end half a minute later. 0:
+    never."""
     drain_hold_s: float = 0.0
-    """When told to stop: seconds for which health checks say NOT_SERVING before vehicles are asked
-    to go to another server, long enough for a proxy to notice (docs/how-to/operations.md). 0:
-    nobody is asked, and streams end with the frames that were taken."""
+    """Seconds after the signal to stop for which health checks say NOT_SERVING before vehicles are
+    asked to go to another server: long enough for a proxy to notice (docs/how-to/operations.md). 0:
+    vehicles are not asked, and streams end with the frames that were taken."""
     server_budget: ServerBudget = ServerBudget()
     identity_budget: IdentityBudget = IdentityBudget()
     admission: AdmissionLimits = AdmissionLimits()

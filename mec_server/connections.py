@@ -1,9 +1,9 @@
-"""Connections of the server's own process: how many there may be, and what each may cost.
+"""Limits on the connections of this process: their number, and the cost of each.
 
-gRPC limits connections in total and the time of a handshake. It knows no limit by address, and of
-what happens below a call (pings, settings, headers without end, calls that are reset, headers that
-are named ten thousand times) it tells nobody; by the time a call is seen its headers are in memory.
-So the sockets of this process are looked at many times a second, and shut down where
+gRPC limits connections in total and the time of a handshake. It knows no limit for one address, and
+reports nothing of what happens below a call (pings, settings, endless headers, calls that are
+reset, headers with ten thousand names); by the time a call is seen its headers are in memory. So
+the sockets of this process are examined many times a second, and closed where
 
 * one address has too many of them, or one identity;
 * more bytes came in than became messages (``explain``): what a peer sends beyond that it sends to
@@ -11,12 +11,12 @@ So the sockets of this process are looked at many times a second, and shut down 
   counts as some of these bytes, and where that alone is too much, nothing waits for the next look;
 * a call's headers are larger than any client's (``offend``).
 
-Who did one of these but the first is *barred*: for some seconds the kernel drops what its address
-sends to the listening socket, so that it costs nothing to come again; connections that others have
-from there stay as they are. An address is a source of packets, not an identity: vehicles that come
-anew through the same translator of addresses wait for as long. Peers that are known to be proxies
-are exempt. A kernel's firewall does more (``deploy/nftables/mec-server.nft``), where there is one.
-Linux only: it lists ``/proc/self/fd``.
+Every reason but the first also *bars* the address: for some seconds the kernel drops its packets to
+the listening socket, so that new attempts cost nothing; existing connections from there stay as
+they are. An address is a source of packets, not an identity: vehicles that connect anew through the
+same address translator wait for as long. Peers that are known proxies are exempt. A firewall
+(``deploy/nftables/mec-server.nft``) does more where there is one. Linux only: it lists
+``/proc/self/fd``.
 """
 
 from __future__ import annotations
@@ -41,30 +41,33 @@ __all__ = ["MOST_HEADER_BYTES", "ClosedConnections", "Connections", "keep_silent
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 SILENT_S = 5
-"""For how long a connection may be silent before gRPC is given it; TCP rounds up."""
+"""Seconds for which a connection may be silent before gRPC is given it; TCP rounds up."""
 
 V6_NETWORK_BITS = 64
-"""What a site has of IPv6 addresses at least, so its addresses count as one (RFC 6177)."""
+"""The addresses of one such IPv6 network count as one, since a site has at least a /64 (RFC
+6177)."""
 
 MOST_HEADER_BYTES = 16_384
-"""Of a call, names and values; ours have a few hundred."""
+"""Most bytes of a call's headers, names and values; ours have a few hundred."""
 
 UNEXPLAINED_BYTES = 4 << 20
-"""What a connection may have sent that became no message: more than waits to be read of a rig of 18
-cameras, two large frames each, while the server is too busy to read."""
+"""Bytes that a connection may have sent without their becoming messages: more than waits to be read
+from a rig of 18 cameras, two large frames each, while the server is too busy to read."""
 UNCALLED_BYTES = 256 << 10
-"""The same of a connection on which no call was seen yet: a Hello has some kB."""
+"""The same for a connection on which no call was seen yet: a Hello has some kB."""
 UNEXPLAINED_BYTES_PER_S = 64 << 10
-"""By so much that becomes less: acknowledgements, pings, headers, consumers' requests."""
+"""Rate at which such bytes are forgiven: acknowledgements, pings, headers, consumers' requests."""
 OVERHEAD = 1.1
-"""Bytes of TLS and HTTP/2 for each of a message, at most; of short ones ``MESSAGE_OVERHEAD``."""
+"""Bytes of TLS and HTTP/2 per byte of a message, at most; short messages add
+``MESSAGE_OVERHEAD``."""
 MESSAGE_OVERHEAD = 256
 REFUSED_CALL_BYTES = 128 << 10
-"""What a call counts as that a budget refused: 32 of them, and one more in two seconds, pass."""
+"""Bytes that a refused call counts as: 32 of them pass, and one more every two seconds."""
 
 BARRED_S = 10.0
 MOST_BARRED = 60
-"""Addresses at once, the newest: jumps of the kernel's filter reach 255 instructions."""
+"""Most addresses that are barred at once, the newest: jumps of the kernel's filter reach 255
+instructions."""
 
 BYTES_RECEIVED = struct.Struct("128xQ")
 """``tcpi_bytes_received`` in ``struct tcp_info`` (linux/tcp.h)."""
@@ -99,7 +102,8 @@ def source_of(address: str) -> str:
 
 @dataclass(frozen=True)
 class ClosedConnections:
-    """Connections of one source that were shut down for one reason; ``barred``: its address."""
+    """Connections of one source that were closed for one reason; ``barred``: its address is barred,
+    too."""
 
     source: str
     limit: Limit
@@ -109,7 +113,7 @@ class ClosedConnections:
 
 @dataclass
 class ByteAccount:
-    """One connection's: what is known of it, and what it sent that became no message."""
+    """The bytes of one connection that became no message."""
 
     inode: str
     received_bytes: int = 0
@@ -126,7 +130,7 @@ class ByteAccount:
 
 @dataclass
 class PeerNotes:
-    """What calls told of a connection since the last look at it."""
+    """What calls have reported about a connection since the last sweep."""
 
     explained_bytes: float = 0.0
     identity: str = ""
@@ -136,11 +140,12 @@ class PeerNotes:
 
 
 class Connections:
-    """Lets each address hold ``of_address`` connections, and each identity ``of_identity`` (0: any
-    number); the newest beyond are cut, and those that cost too much. ``listen`` says to which port.
+    """Lets each address hold ``of_address`` connections, and each identity ``of_identity`` (0: no
+    limit).
 
-    ``explain``, ``refuse``, ``claim``, ``exempt`` and ``offend`` are called by calls, with their
-    peer as gRPC names it, and cost nothing to speak of; ``sweep`` by one thread of its own.
+    The newest connections beyond are closed, as are those that cost too much. ``listen`` sets the
+    port. Calls report their peer, as gRPC names it, to ``explain``, ``refuse``, ``claim``,
+    ``exempt`` and ``offend``, which are cheap; one thread of its own calls ``sweep``.
     """
 
     def __init__(self, of_address: int, of_identity: int) -> None:
@@ -148,7 +153,7 @@ class Connections:
         self._of_identity = of_identity
         self._port = 0
         self._accounts: dict[str, ByteAccount] = {}
-        """By peer, oldest first."""
+        """The open connections by peer, oldest first."""
         self._notes: defaultdict[str, PeerNotes] = defaultdict(PeerNotes)
         self._absent: set[str] = set()
         self._barred_s: dict[str, float] = {}
@@ -170,7 +175,7 @@ class Connections:
             notes.explained_bytes += OVERHEAD * message_bytes + MESSAGE_OVERHEAD
 
     def refuse(self, peer: str, now: float) -> None:
-        """Note that a call was refused for a budget; cut a connection of too many at once.
+        """Note that a call was refused for a budget; close a connection of too many at once.
 
         By the next sweep hundreds of calls would have been answered, one by one, before others'.
         """
@@ -182,12 +187,12 @@ class Connections:
             self.offend(peer, Limit.CONNECTION_BYTES, now)
 
     def claim(self, peer: str, identity: str) -> None:
-        """Note whose connection it is."""
+        """Note the identity of a connection."""
         with self._lock:
             self._notes[peer].identity = identity
 
     def exempt(self, peer: str) -> None:
-        """Never cut this connection: it is a proxy's, and carries others' calls."""
+        """Never close this connection: it is a proxy's, and carries others' calls."""
         with self._lock:
             self._notes[peer].is_exempt = True
 
@@ -209,7 +214,8 @@ class Connections:
                 _shut(connection)
 
     def sweep(self, now: float) -> list[ClosedConnections]:
-        """ClosedConnections what is too much, bar where it came from, and return what was cut.
+        """Close connections that are too many or cost too much, and bar their addresses; return
+        what was closed.
 
         Not for the event loop: it takes about 10 us a connection.
         """
@@ -230,7 +236,7 @@ class Connections:
         return cuts
 
     def _judge(self, found: dict[str, Connection], now: float) -> dict[str, Limit]:
-        """Bring the accounts up to date; return which connections are too much, and why."""
+        """Update the accounts; return the connections to close, and the reasons."""
         passed_s = 0.0 if self._swept_s is None else now - self._swept_s
         self._swept_s = now
         offended: dict[str, Limit] = {}
@@ -294,7 +300,7 @@ class Connections:
         return reasons
 
     def _bar(self, sources: list[str], now: float) -> None:
-        """Have the kernel drop what comes from ``sources``, and take earlier ones in again."""
+        """Have the kernel drop packets from ``sources``, and accept earlier ones again."""
         barred_s = {source: s for source, s in self._barred_s.items() if s > now}
         for source in sources:
             barred_s.pop(source, None)
@@ -327,7 +333,7 @@ def bar(listening: socket.socket, sources: Iterable[str]) -> None:
 
 
 Instruction = tuple[int, int, int, int]
-"""Of the classic BPF machine: operation, jump if true, jump if false, operand."""
+"""An instruction of the classic BPF machine: operation, jump if true, jump if false, operand."""
 LOAD_WORD, LOAD_BYTE, SHIFT_RIGHT, JUMP_IF_EQUAL, RETURN = 0x20, 0x30, 0x74, 0x15, 0x06
 NETWORK_HEADER = 0xFFF00000
 """``SKF_NET_OFF``: offsets from here on are into the IP header (linux/filter.h)."""

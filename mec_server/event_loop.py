@@ -36,17 +36,18 @@ Work = Callable[[], Any]
 Done = Callable[[Any], None]
 
 BACKGROUND_NICE = 10
-"""Of threads whose work can wait: beside others that are busy they get a tenth of a processor."""
+"""Niceness of threads whose work can wait: beside busy ones they get a tenth of a processor."""
 
 MAX_SUBSTITUTES = 16
-"""Threads that work in place of waiting ones, at most."""
+"""Most threads that work in place of waiting ones."""
 
 
 class FairQueue(Generic[T]):
-    """Items of several owners, taken in turn: one of each owner that has any, again and again.
+    """A queue that takes items of several owners in turn: one of each owner that has any, again and
+    again.
 
-    An owner's items keep their order. Whoever has no item waiting gets a turn after at most one
-    item of each other owner, however many those have. Sans-IO and not thread-safe.
+    An owner's items keep their order. An owner that has no item waiting gets a turn after at most
+    one item of each other owner, however many those have. Sans-IO and not thread-safe.
     """
 
     def __init__(self) -> None:
@@ -245,16 +246,15 @@ def _outcome(work: Callable[[], R]) -> R | Exception:
 
 
 def give_way(nice: int) -> None:
-    """Let other threads come before the one that calls, where processors are scarce
-    (setpriority(2))."""
+    """Lower the priority of the calling thread, where processors are scarce (setpriority(2))."""
     thread = threading.get_native_id()
     before = os.getpriority(os.PRIO_PROCESS, thread)
     os.setpriority(os.PRIO_PROCESS, thread, before + nice)  # kept in range there
 
 
 def work_when_idle(thread: int = 0) -> None:
-    """Have a thread (by its native id; 0: the one that calls, and what it starts) work only while a
-    processor has nothing else to do: SCHED_IDLE, see sched(7).
+    """Let a thread (by its native id; 0: the calling one and what it starts) work only while a
+    processor is idle: SCHED_IDLE, see sched(7).
 
     The lowest nice value is not enough. Whoever wakes displaces a thread of SCHED_IDLE at once, one
     of nice 19 not always: beside four vehicles, a process of nice 19 that renders took the p99 of

@@ -78,8 +78,8 @@ class Guard(grpc.aio.ServerInterceptor):
         return self._access.current.may_fetch(peer_identity(context.auth_context()), tiles)
 
     def payer(self, context: Context) -> Context:
-        """Return the context that names who pays for a call: its client, or its peer if that is
-        no proxy that may speak for one."""
+        """Return the context that names the account billed: the client behind a trusted proxy, else
+        the peer."""
         try:
             return self._client(context)[1]
         except RfedgeError:

@@ -1,11 +1,11 @@
-"""The learning process (``mec_server.tile_learning``) and the server's hold on it.
+"""The learning process (``mec_server.tile_learning``), and the server's supervision of it.
 
 The process runs on one core, while a processor is idle; it ends with the server, whose end of a
-pipe it reads. One that ends by itself, or is killed, is started again. A second process on the same
+pipe it reads. If it ends by itself, or is killed, it is started again. A second process on the same
 recordings waits until the first is gone.
 
-What vehicles show that are not recorded never reaches it: the server tries learnt fields on that
-itself (``UnrecordedTrials``), in memory, and tells the process how many bits more they took.
+Pictures of vehicles that are not recorded never reach it: the server tries learnt fields on those
+itself, in memory (``UnrecordedTrials``), and reports the increase in bits to the process.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ __all__ = ["Learner", "Learning", "UnrecordedTrials", "main"]
 log = structlog.get_logger()
 
 EVERY_S = 0.5
-"""From the end of one round to the next."""
+"""Pause between two rounds."""
 RESTART_S = 30.0
 """A process that ended is started again this long after its start, at the earliest."""
 STOP_S = 5.0
 MOST_PAUSE_S = 2.0
-"""Between two pictures of one trial: who pauses for longer makes room for another."""
+"""Longest pause between two pictures of one trial; after a longer one another camera is tried."""
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 Command = tuple[str, ...]
 
@@ -109,7 +109,7 @@ class Learner:
         self._show(read_histories(self._job.recordings))
 
     def report(self, harm: BitsIncrease) -> None:
-        """Tell the process what was found; nothing if there is none now."""
+        """Report an increase to the process, if it runs."""
         if self._process is not None and self._process.stdin is not None:
             with suppress(BrokenPipeError, ValueError):  # it has ended, or is being restarted
                 self._process.stdin.write(json.dumps(asdict(harm)).encode() + b"\n")
@@ -180,20 +180,20 @@ class Learning:
 
 @dataclass(frozen=True)
 class _Watched:
-    """A learnt field that vehicles take now."""
+    """A learnt field that vehicles use now."""
 
     tile: str
     replaced_id: str
 
 
 class UnrecordedTrials:
-    """Tries learnt fields on what vehicles show that are not recorded.
+    """Tries learnt fields on pictures of vehicles that are not recorded.
 
-    Of one camera at a time the pictures of ``CHECK_FRAMES`` frames in a row stay in memory until
-    they were coded against the learnt field and against what it replaced, on a thread that works
-    while a processor is idle; how many bits more the one took is all that is told (``report``). A
-    camera's turn comes again after ``CHECK_EVERY`` frames. ``open_field`` opens fields for that
-    thread alone; ``failed`` is called with what went wrong there.
+    It keeps ``CHECK_FRAMES`` pictures in a row of one camera in memory until they were coded
+    against the learnt field and against the field that it replaced, on a thread that works while a
+    processor is idle; only the increase in bits is reported. A camera is tried again after
+    ``CHECK_EVERY`` frames. ``open_field`` opens fields for that thread alone; ``failed`` is called
+    with its errors.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class UnrecordedTrials:
         self._worker.close()
 
     def watch(self, histories: Mapping[str, TileHistory]) -> None:
-        """Try what these tell of, unless it was withdrawn."""
+        """Try the learnt fields in these histories, unless they were withdrawn."""
         self._watched = {
             one.field_id: _Watched(tile, one.replaced_id)
             for tile, history in histories.items()
@@ -270,7 +270,7 @@ def _posed(view: ReceivedPicture) -> PosedPicture:
 
 
 def main() -> None:
-    """Be the learning process: ``mec_server.learner JOB LOG_FORM``."""
+    """Run the learning process: ``mec_server.learner JOB LOG_FORM``."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     work_when_idle()
     job = _job(json.loads(sys.argv[1]))
@@ -294,7 +294,7 @@ def _try(rounds: LearningRounds) -> None:
 
 
 def _follow_the_server(rounds: LearningRounds) -> None:
-    """Take what the server reports, a line each, and end with it."""
+    """Read the server's reports, a line each, and end with the server."""
     for line in sys.stdin.buffer:
         rounds.report(BitsIncrease(**json.loads(line)))
     os._exit(0)

@@ -37,7 +37,7 @@ log = structlog.get_logger()
 
 
 class BackgroundTask(StrEnum):
-    """What runs in the server beside its event loop's callbacks, and what an exception ends."""
+    """A task that runs beside the event loop's callbacks, and the effect of an exception in it."""
 
     PUBLICATIONS = "publications"
     """Looks for newly published fields; goes on with its next look."""
@@ -72,7 +72,7 @@ class BackgroundTask(StrEnum):
 
 
 class OpeningResult(StrEnum):
-    """How the opening of a stream's decoders ended."""
+    """The result of opening a stream's decoders."""
 
     OPENED = "opened"
     FAILED = "failed"

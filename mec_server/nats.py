@@ -1,9 +1,9 @@
-"""One connection to NATS, made again for ever, and the field archives that pass through it.
+"""One connection to NATS, made again for ever, and the exchange of field archives over it.
 
-What is done with the connection is a coroutine that is given each new one and cancelled when that
-is lost: nothing that was to be sent over the old one is sent over the next. The client library
-leaves TLS to the server, which could then be anybody who says that there is none; here what was
-asked for is insisted on, before the login is sent.
+A coroutine is given each new connection and is cancelled when that is lost: nothing that was to be
+sent over the old one is sent over the next. The client library leaves TLS to the server, which
+could then be anybody who says that there is none; here TLS is insisted on if it was asked for,
+before the login is sent.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ log = structlog.get_logger()
 
 CONNECT_S: Final = 2
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 0.5
-"""Between two attempts: a consumer is to be back 2 s after NATS is."""
+"""Delay between two attempts: a consumer is to be back 2 s after NATS is."""
 CLOSE_S: Final = 1.0
 STALLED_S: Final = 3.0
-"""NATS that took nothing for so long is given up, and connected to again."""
+"""A connection on which NATS took nothing for this long is closed and made again."""
 PING_S: Final = 2
 PENDING_BYTES: Final = 8 << 20
-"""What waits for the socket, at most; the outbox before it holds one picture a camera."""
+"""Most bytes that wait for the socket; the outbox before it holds one picture a camera."""
 REQUEST_S: Final = 3.0
 EXCHANGE_EVERY_S: Final = 2.0
 NO_JETSTREAM = "JetStream is off; start nats-server with -js, or with deploy/nats/nats.conf"
@@ -69,7 +69,7 @@ class TlsRefusedError(Error):
 
 
 class _Client(Client):
-    """Sends nothing of ours before TLS is spoken, if it is to be."""
+    """A client that sends nothing before TLS is established, if TLS is asked for."""
 
     def __init__(self, is_secure: bool) -> None:
         super().__init__()
@@ -85,7 +85,7 @@ class _Client(Client):
 class NatsLink:
     """Connects to one of ``servers`` as ``name``, again and again.
 
-    ``told`` is called with whether it is connected and what to say of it, when that changes.
+    ``told`` is called with whether it is connected and with a detail, when that changes.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ def _place(client: Client) -> str:
 
 
 async def places_bucket(client: Client) -> KeyValue:
-    """Return the bucket that says where vehicles are; it is made if it is not there.
+    """Return the bucket of vehicles' locations; make it if it is not there.
 
     Raises ``NoJetStreamError`` where NATS keeps nothing.
     """
@@ -288,9 +288,12 @@ async def _receive(objects: ObjectStore, field_id: str, file: BufferedWriter) ->
 
 
 class FieldExchange:
-    """Puts the archives of the current ``tiles`` into the object store (of a server without tiles:
-    all of ``index``), and fetches those that the manifest in ``folder`` names and ``index`` lacks;
-    calls ``fetched`` after each."""
+    """Exchanges field archives with other servers through the object store.
+
+    It puts the archives of the current ``tiles`` there (without tiles: all of ``index``), and
+    fetches those that the manifest in ``folder`` names and ``index`` lacks; ``fetched`` is called
+    after each.
+    """
 
     def __init__(
         self,

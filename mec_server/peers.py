@@ -1,9 +1,9 @@
-"""Peers of gRPC calls: whom a call is charged to, and how it is told that it is refused.
+"""Peers of gRPC calls: the identity that a call is charged to, and the status of a refusal.
 
 ``ChargeRpcs`` charges every call of the server, whatever its service, for as long as it lasts: also
 health checks, calls whose peer does not read its status, those that ``mec_server.guard`` refuses,
-and those of methods that there are not. What fails unexpectedly in a call is told to the log; the
-peer learns no more than that it failed.
+and those of unknown methods. An unexpected failure of a call is logged; the peer learns no more
+than that it failed.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ STATUS_OF: tuple[tuple[type[RfedgeError], grpc.StatusCode], ...] = (
     (BackendUnavailable, grpc.StatusCode.UNIMPLEMENTED),
     (CodecError, grpc.StatusCode.INTERNAL),
 )
-"""Which gRPC status each of our errors becomes."""
+"""The gRPC status of each of our errors."""
 
 
 def status_of(error: RfedgeError) -> grpc.StatusCode:
@@ -72,13 +72,14 @@ def status_of(error: RfedgeError) -> grpc.StatusCode:
 
 
 CALL_BYTES = 1024
-"""Of a call that is let in, beside the messages of a vehicle's stream: headers and a request."""
+"""Bytes that an admitted call is taken to cost beside a stream's messages: headers and a
+request."""
 
 
 def peer_account(context: Context) -> tuple[str, bool]:
-    """Return whom a call is charged to, and whether a certificate names it.
+    """Return the identity that a call is charged to, and whether a certificate names it.
 
-    Without certificates, or for one without a name, that is the connection.
+    Without a certificate that names an identity, that is the connection.
     """
     identity = peer_identity(context.auth_context())
     if identity is None or not identity.uris:
@@ -104,8 +105,10 @@ def _retry_after(error: RfedgeError) -> tuple[tuple[str, str], ...]:
 
 
 class Slots:
-    """Lets calls of one kind hold one of ``resource`` each; ``limited`` counts who is refused,
-    ``limiter`` is that of lines about them."""
+    """Lets each call of one kind hold one of ``resource``.
+
+    ``limited`` counts refusals; ``limiter`` bounds the log lines about peers.
+    """
 
     def __init__(
         self,
@@ -149,8 +152,9 @@ UNKNOWN_METHOD: grpc.RpcMethodHandler[bytes, bytes] = grpc.stream_stream_rpc_met
 class ChargeRpcs(grpc.aio.ServerInterceptor):
     """Charges calls to their identities; ``limited`` counts the limit that refused one.
 
-    ``payer`` returns the context that names who pays for a call: not the peer, behind a proxy. It
-    belongs before the interceptors that refuse calls, or those cost nobody anything.
+    ``payer`` returns the context that names the account billed: behind a trusted proxy the
+    client's, else the peer's. It belongs before the interceptors that refuse calls, or those cost
+    nobody anything.
     """
 
     def __init__(

@@ -37,7 +37,7 @@ AuthContext = Mapping[str, Iterable[bytes]]
 
 
 class Proxies:
-    """The proxies whose word is taken, by name; none: nobody's is."""
+    """Trusted proxies, by name; without names none is trusted."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._uris = {(identity_uri(Role.PROXY, name),) for name in names}

@@ -1,15 +1,16 @@
-"""Records what vehicles agreed to as datasets: FOLDER/<vehicle>/<camera>/<start>-<session>/.
+"""Records pictures of vehicles that agreed to it, as datasets:
+FOLDER/<vehicle>/<camera>/<start>-<session>/.
 
 Each such part is a ``recording.jsonl`` and its pictures (``rfcore.dataset.recorded_session``). The
 first epoch's pictures are named by their sequence alone (000007.png); later ones have the epoch in
-front (e0003-000007.png), since sequences begin again. A disk that fails ends the recording for
+front (e0003-000007.png), since sequences begin again. An error of the disk ends the recording for
 good, and never the streaming.
 
-How much is kept: by age, and by bytes. When they must fall, they do in the tile that has most: a
-vehicle with more than a quarter of them gives its oldest part, and where none has so many, the
-tile's oldest part goes. So one busy vehicle or tile evicts no other. ``start`` is when a part was
-begun, milliseconds of the Unix epoch. A part is closed early enough that whole parts can be deleted
-to keep both bounds; a part that is still written is deleted, too, when it must be.
+Parts are deleted by age, and where there are too many bytes: then the tile that has most loses the
+oldest part of a vehicle that has more than a quarter of the tile's bytes, or else its oldest part.
+So one busy vehicle or tile evicts no other. ``start`` is when a part was begun, milliseconds of the
+Unix epoch. A part is closed early enough that whole parts can be deleted to keep both bounds; a
+part that is still written is deleted, too, when it must be.
 """
 
 from __future__ import annotations
@@ -49,16 +50,16 @@ __all__ = [
 MAX_WAITING = 32
 """Pictures that may wait for the disk; beyond it decoding waits, and with it the vehicle."""
 TIDY_EVERY_S = 60.0
-"""How often old parts are looked for while nothing is written."""
+"""Period of checks for old parts while nothing is written."""
 PARTS = 16
 """Parts are closed at this fraction of either bound, so that at least so many fill it."""
 VEHICLE_SHARE = 0.25
-"""Of a tile's bytes: a vehicle with more gives its own pictures first."""
+"""Share of a tile's bytes; a vehicle with more loses its own pictures first."""
 
 
 @dataclass(frozen=True)
 class KeepLimits:
-    """What a recording may take: bytes of all files, and seconds since a picture was written."""
+    """Limits of a recording: bytes of all files, and seconds since a picture was written."""
 
     max_bytes: int
     max_age_s: float
@@ -117,9 +118,9 @@ class RecordingQuota:
         return now_ms - _start_ms(part) >= 1e3 * self._limits.max_age_s / PARTS
 
     def make(self, wanted_bytes: int, now_ms: int) -> None:
-        """Delete parts that are too old, then of the largest share, until the bytes fit.
+        """Delete parts that are too old, then those of the largest share, until the bytes fit.
 
-        Raises ``OSError`` where one cannot be.
+        Raises ``OSError`` where one cannot be deleted.
         """
         oldest_ms = now_ms - 1e3 * self._limits.max_age_s
         for part in [part for part in self._bytes if _start_ms(part) <= oldest_ms]:
@@ -128,7 +129,8 @@ class RecordingQuota:
             self._delete(self._most_dispensable())
 
     def _most_dispensable(self) -> Path:
-        """Return the oldest part of the tile with most bytes, or of who has too many of them."""
+        """Return the oldest part of the tile with most bytes, or of a vehicle that has too many of
+        them."""
         tile, _ = _largest(self._bytes, self._tiles.__getitem__)
         parts = {part: n for part, n in self._bytes.items() if self._tiles[part] == tile}
         vehicle, size_bytes = _largest(parts, _vehicle_of)

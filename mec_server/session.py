@@ -105,7 +105,7 @@ class RenderTooLate(PacketRejected):
 
 
 class SessionState(StrEnum):
-    """Where the conversation is."""
+    """State of the conversation."""
 
     AWAITING_HELLO = "awaiting_hello"
     OPENING = "opening"
@@ -115,9 +115,9 @@ class SessionState(StrEnum):
 
 
 class ServerSession:
-    """One vehicle's stream; ``held_field_ids`` are the fields this server has.
+    """One vehicle's stream; ``held_field_ids`` are the fields that this server has.
 
-    ``identity``: whom its certificate names; without one any name is taken.
+    ``identity``: named by the vehicle's certificate; without one any vehicle name is accepted.
     """
 
     def __init__(
@@ -332,7 +332,7 @@ class ServerSession:
         return bool(self._outbox) or self.closed is not None
 
     def messages_to_send(self, now: float) -> list[ServerMessage]:  # noqa: ARG002
-        """Return, once, what the vehicle is to be told; credits that grew come last."""
+        """Return the messages for the vehicle, once; credits that grew come last."""
         messages = list(self._outbox)
         self._outbox.clear()
         answered = {m.address.camera_id for m in messages if isinstance(m, (Ack, Nack))}
@@ -359,12 +359,12 @@ class ServerSession:
 
     @property
     def takes_notices(self) -> bool:
-        """Whether the vehicle is welcome and wants to be told of the street."""
+        """Whether the vehicle was welcomed and wants notices."""
         asked = self.hello is not None and self.hello.take_notices
         return asked and self.state is SessionState.OPEN
 
     def tell(self, notice: StreetNotice) -> None:
-        """Tell a vehicle that takes notices of the street; one that does not read misses it."""
+        """Send a notice to a vehicle that takes them; one that does not read misses it."""
         if self.takes_notices and len(self._outbox) < MAX_UNREAD // 2:
             self._say(notice)
 
@@ -374,7 +374,8 @@ class ServerSession:
         return self._deadline_s if self.state in timed else None
 
     def handle_timer(self, now: float) -> None:
-        """Let a vehicle go that says nothing, unless its frames are in work; it may come back."""
+        """End the stream of a silent vehicle, unless its frames are being decoded; it may come
+        back."""
         timer = self.get_timer()
         if timer is None or now < timer:
             return

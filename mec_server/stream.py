@@ -50,8 +50,8 @@ log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[bytes, bytes]
 
 MAX_AHEAD_S, MAX_BEHIND_S = 1.0, 60.0
-"""A capture time further ahead of the server's clock, or further behind it, is no time of capture:
-clocks kept by NTP differ by milliseconds, and no frame is delivered after a minute."""
+"""A capture time further ahead of the server's clock, or further behind it, is implausible: clocks
+kept by NTP differ by milliseconds, and no frame is delivered after a minute."""
 
 UNKNOWN_VEHICLE = ""
 """The vehicle id under which a stream is counted until its Hello is accepted."""
@@ -134,18 +134,18 @@ class Stream:
 
     @property
     def session_id(self) -> str:
-        """Which stream it is."""
+        """The id of the stream."""
         return self._session.session_id
 
     @property
     def vehicle_id(self) -> str:
-        """Whose stream it is; empty before its Hello was accepted."""
+        """The vehicle of the stream; empty before its Hello was accepted."""
         hello = self._session.hello
         return "" if hello is None else hello.vehicle_id
 
     @property
     def takes_notices(self) -> bool:
-        """Whether the vehicle wants to be told of the street."""
+        """Whether the vehicle wants notices."""
         return self._session.takes_notices
 
     @property
@@ -161,7 +161,7 @@ class Stream:
         return frozenset() if hello is None else frozenset(hello.field_ids)
 
     def tell(self, notice: StreetNotice) -> None:
-        """Pass on what concerns the vehicle on its way."""
+        """Send a notice to the vehicle."""
         self._session.tell(notice)
         self._wake.set()
 
@@ -173,7 +173,7 @@ class Stream:
         self._wake.set()
 
     def silent_s(self, now: float) -> float:
-        """Return for how long the vehicle has sent nothing; 0 while it waits for an answer."""
+        """Return how long the vehicle has sent nothing; 0 while it waits for an answer."""
         return self._session.silent_s(now)
 
     def displace(self, error: LimitExceeded) -> None:
@@ -183,7 +183,7 @@ class Stream:
         self._wake.set()
 
     def close(self) -> None:
-        """Remove every trace of the stream: twin, metrics, decoders, and what Hello was granted."""
+        """Remove the stream from twin, metrics and ledger, and close its decoders."""
         if self._is_closed:
             return
         self._is_closed = True

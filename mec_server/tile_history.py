@@ -1,4 +1,4 @@
-"""What the server has learnt of each tile, as it is kept beside the recordings.
+"""The history of what was learnt of each tile, kept beside the recordings.
 
 RECORDINGS/.learning/tiles.json holds a ``TileHistory`` by the tile's name: what was learnt, tried
 and withdrawn. The learning process writes it (``mec_server.tile_learning``); the server reads it
@@ -25,10 +25,10 @@ HISTORIES = "tiles.json"
 
 @dataclass(frozen=True)
 class Learnt:
-    """One field that was learnt; written before it is published, so that none goes unwatched.
+    """One learnt field; written before it is published, so that none goes unchecked.
 
-    ``replaced_id``: what vehicles took before, and take again if it is withdrawn. ``identities``:
-    of how many vehicles the passes were; 0 in histories of before, which do not say.
+    ``replaced_id``: the field that vehicles used before, and use again if it is withdrawn.
+    ``identities``: the number of vehicles whose passes were used.
     """
 
     field_id: str
@@ -43,14 +43,17 @@ class Learnt:
 
 @dataclass(frozen=True)
 class TileHistory:
-    """What was learnt of one tile. ``tried``: recordings that were used, as paths below the folder;
-    ``checked``: frames of each recording and learnt field that were looked at for a withdrawal."""
+    """The history of one tile.
+
+    ``tried``: recordings that were used, as paths below the folder; ``checked``: for each recording
+    and learnt field, the number of frames that were checked for a withdrawal.
+    """
 
     learnt: tuple[Learnt, ...] = ()
     tried: tuple[str, ...] = ()
     checked: Mapping[str, int] = field(default_factory=dict)
     cpu: tuple[tuple[int, float], ...] = ()
-    """When CPU time was spent on learning, and seconds of it, of the last hour."""
+    """CPU time spent on learning in the last hour: when, and how many seconds."""
 
     def newest(self, tile: str) -> Iterator[LearntLight]:
         """Yield what was learnt last of each light of ``tile``, whose history this is."""
@@ -62,7 +65,7 @@ class TileHistory:
 
     @property
     def withdrawals(self) -> int:
-        """How many updates made bits worse."""
+        """The number of updates that were withdrawn because they increased bits."""
         return sum(one.withdrawn for one in self.learnt)
 
 

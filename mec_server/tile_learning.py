@@ -1,14 +1,14 @@
-"""What the learning process does with recordings: one round over the published tiles at a time.
+"""The work of the learning process: one round over the published tiles at a time.
 
 Files: the recordings of ``mec_server.recorder``, the folder of fields, and RECORDINGS/.learning/:
 ``tiles.json``, what was learnt, tried and withdrawn of each tile (``TileHistory``), and a lock that
 one process holds. A round first checks what was published (``withdraw_worse``): the newest frames
-that vehicles coded against a learnt field are coded again against it and against what it replaced;
-of vehicles that are not recorded the server does that, and says what it found (``report``).
-Then it learns (``learn_tile``): passes that are over and were not used before, sorted by light,
-without outliers; tried on frames held back; published as ``rfedge field publish --light`` does.
-What is published is one rename of the manifest, so a round may end anywhere. An identity is the id
-of a vehicle, which a certificate ties to it where the server asks for one.
+that vehicles coded against a learnt field are coded again against it and against the field that it
+replaced; for vehicles that are not recorded the server does that, and reports the result
+(``report``). Then it learns (``learn``): from passes that are over and were not used before, sorted
+by light, without outliers; the result is tried on frames held back and published as ``rfedge field
+publish --light`` does. Publishing is one rename of the manifest, so a round may end anywhere. An
+identity is the id of a vehicle, which a certificate ties to it where the server asks for one.
 """
 
 from __future__ import annotations
@@ -60,22 +60,23 @@ log = structlog.get_logger()
 
 MOST_PASSES = 6
 CHECK_FRAMES = 8
-"""Frames in a row that are tried to see whether a published field makes bits worse."""
+"""Frames in a row that are coded to check whether a published field increases bits."""
 CHECK_EVERY = 24
-"""Frames of one camera between two checks: twice that, at most, until a harm is seen."""
+"""Frames of one camera between two checks; an increase is seen after at most twice as many."""
 HOUR_MS = 3_600_000
 WATCH_EVERY_MS = 500
-"""How often published fields are checked while another is learnt or tried: with 24 frames between
-two checks a harm is seen within 50 frames, at 10 and 30 Hz."""
+"""Period of checks of published fields while another is learnt or tried: with 24 frames between two
+checks an increase in bits is seen within 50 frames, at 10 and 30 Hz."""
 AGAIN_MS = 600_000
-"""What could not be learnt from is looked at again after this time, or when there is more."""
+"""Recordings that could not be learnt from are tried again after this time, or when there are
+more."""
 FRESH_S = 120.0
-"""A recording to which nothing was added for so long is not looked at for withdrawals."""
+"""A recording to which nothing was added for this long is not checked for withdrawals."""
 
 
 @dataclass(frozen=True)
 class LearningJob:
-    """What the learning process is told; ``mec_server.config.LearnSettings`` says what is meant."""
+    """The settings of the learning process; see ``mec_server.config.LearnSettings``."""
 
     fields: Path
     recordings: Path
@@ -100,8 +101,8 @@ class LearningJob:
 
 @dataclass(frozen=True)
 class BitsIncrease:
-    """How many percent more bits a vehicle that is not recorded took for a field that was learnt
-    than it would have for what this replaced; below 0: fewer."""
+    """The increase in bits, in percent, of a vehicle that is not recorded, for a learnt field over
+    the field that it replaced; negative for a decrease."""
 
     tile: str
     field_id: str
@@ -110,8 +111,8 @@ class BitsIncrease:
 
 
 def percent_worse(before: RadianceField, after: RadianceField, drive: Pass) -> float:
-    """Return how many percent more bits the newest ``CHECK_FRAMES`` of a pass take ``after`` than
-    ``before``; 0 for fewer frames, or for such as agree with no field."""
+    """Return the increase in bits, in percent, of the newest ``CHECK_FRAMES`` of a pass for
+    ``after`` over ``before``; 0 for fewer frames, or for frames that agree with no field."""
     newest = Pass(drive.identity, drive.pictures[-CHECK_FRAMES:])
     if len(newest.pictures) < CHECK_FRAMES or not without_outliers(after, [newest]):
         return 0.0
@@ -132,14 +133,14 @@ class LearningRounds:
         self._reports: SimpleQueue[BitsIncrease] = SimpleQueue()
 
     def report(self, harm: BitsIncrease) -> None:
-        """Take what the server found; may be called by another thread than ``run``."""
+        """Take a report of the server; may be called by another thread than ``run``."""
         self._reports.put(harm)
 
     def run(self) -> None:
-        """Withdraw what made bits worse, then learn what there is to learn.
+        """Withdraw fields that increased bits, then learn.
 
-        A tile or a disk that refuses is logged, and tried again later. Raises ``InvalidInput`` for
-        a damaged history, ``FieldFormatError`` for a damaged manifest, ``OSError``.
+        A tile or a disk that fails is logged, and tried again later. Raises ``InvalidInput`` for a
+        damaged history, ``FieldFormatError`` for a damaged manifest, ``OSError``.
         """
         (self._job.recordings / LEARNING).mkdir(parents=True, exist_ok=True)
         histories = read_histories(self._job.recordings)
@@ -172,7 +173,7 @@ def _attempt(learner: TileLearner, work: Callable[[], None]) -> None:
 
 
 class TileLearner:
-    """Learns about one tile; what it did is in ``histories``, which are written at each change."""
+    """Learns about one tile; ``histories`` are written at each change."""
 
     def __init__(self, job: LearningJob, name: str, now_ms: Callable[[], int]) -> None:
         self.name = name
@@ -185,7 +186,7 @@ class TileLearner:
 
     @property
     def history(self) -> TileHistory:
-        """What was done until now."""
+        """The tile's history so far."""
         return self.histories.get(self.name, TileHistory())
 
     def _keep(self, **changes: Any) -> None:
@@ -195,12 +196,13 @@ class TileLearner:
     # --- what was published
 
     def withdraw_worse(self) -> None:
-        """Withdraw each current field that was learnt and costs somebody bits; count it."""
+        """Withdraw each learnt and current field that increases somebody's bits, and count it."""
         for one in self._current():
             self._check(one)
 
     def withdraw_reported(self, harm: BitsIncrease) -> None:
-        """Withdraw a current field that costs a vehicle bits which is not recorded; count it."""
+        """Withdraw a current field that increases the bits of a vehicle that is not recorded, and
+        count it."""
         if harm.percent > self._job.settings().max_loss_percent:
             for one in self._current():
                 if one.field_id == harm.field_id:
@@ -298,7 +300,8 @@ class TileLearner:
         passes: Sequence[Pass],
         watch: Callable[[], None],
     ) -> str:
-        """Say why an update that beats the tile's own field is no better than the light's."""
+        """Return why an update that beats the tile's own field is no better than the light's; empty
+        if it is."""
         if current is base:
             return ""
         _, held_back = split_frames(passes, self._job.frames)

@@ -153,16 +153,16 @@ def _even(picture: I420) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 LOOK_EVERY_S = 0.05
-"""How often the main thread checks for a signal and for the end of the watcher."""
+"""Period at which the main thread checks for a signal and for the end of the watcher."""
 
 FINISH_S = 5.0
-"""How long a watcher that was told to stop may take to complete its files."""
+"""Longest time that a watcher may take to complete its files after it was told to stop."""
 
 UNFINISHED = "rfedge watch: ended before its files were complete\n"
 
 
 class PictureSource(Protocol):
-    """Where pictures come from: a ``TwinClient``, or the servers of one NATS."""
+    """A source of pictures: a ``TwinClient``, or the servers of one NATS."""
 
     def watch(self, subscription: Subscription) -> Generator[TwinPicture | Departure, None, None]:
         """Yield what arrives until ``stop``; raise ``RfedgeError`` if the source is not there."""
@@ -173,7 +173,7 @@ class PictureSource(Protocol):
 
 @dataclass(frozen=True)
 class WatchSettings:
-    """What to watch and what to keep; see ``rfedge watch --help``."""
+    """Settings of ``rfedge watch``; see its ``--help``."""
 
     vehicle_ids: frozenset[str] = frozenset()
     folder: Path | None = None
@@ -193,7 +193,7 @@ class WatchSettings:
 
     @property
     def subscription(self) -> Subscription:
-        """What to ask the source for."""
+        """The subscription for the source."""
         encoding = PictureEncoding.NONE
         if self.encoding is not None:
             encoding = PictureEncoding(self.encoding)

@@ -35,7 +35,7 @@ class EvalLive:
     sources: tuple[str, ...] = ("rtsp", "rtp")
     """Live cameras: rtsp, rtp; none: not measured."""
     source_seconds: float = 300.0
-    """How long each is driven at 10 Hz."""
+    """Duration of each drive at 10 Hz."""
     kill_every: Annotated[float, arg(metavar="SECONDS")] = 60.0
     """Its sender is killed so often, and started again."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")

@@ -34,7 +34,7 @@ class AgeRow:
 
 @dataclass(frozen=True)
 class IngestRow:
-    """From due to Ack, without and with consumers and one browser, in turn on one server."""
+    """Time from due to Ack, without and with consumers and one browser, in turn on one server."""
 
     vehicles: int
     hz: float

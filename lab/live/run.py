@@ -45,7 +45,8 @@ a=rtpmap:96 H264/90000
 """
 KINDS = ("rtsp", "rtp")
 DOWN_S = 3.0
-"""How long a killed sender stays away: longer than the agent takes to call its source lost."""
+"""Time for which a killed sender stays away: longer than the agent takes to call its source
+lost."""
 SETTLED = 0.2
 """Share of the run whose memory is not judged: caches and allocators fill."""
 FIRST_PICTURE_S = 120.0
@@ -53,7 +54,7 @@ FIRST_PICTURE_S = 120.0
 
 @dataclass(frozen=True)
 class LiveCamera:
-    """What is sent and for how long: ``folder`` has pictures and a ``camera.toml``."""
+    """A live camera and its duration: ``folder`` has pictures and a ``camera.toml``."""
 
     kind: str
     folder: Path
@@ -243,7 +244,7 @@ MOST_SECONDS = 86_400.0
 
 @dataclass(frozen=True)
 class LiveJob:
-    """What is measured: see ``EvalLive``."""
+    """The settings of a run: see ``EvalLive``."""
 
     cameras: tuple[int, ...]
     hz: float

@@ -130,7 +130,8 @@ LOADED = (
 
 @dataclass(frozen=True)
 class Seen:
-    """What a page showed: ages of pictures at their showing, and its street's last drawing."""
+    """Measurements of a page: ages of pictures when shown, and the time of its street's last
+    drawing."""
 
     ages_ms: tuple[float, ...]
     drawing_ms: float

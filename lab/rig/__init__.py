@@ -31,13 +31,13 @@ class EvalRig:
     rate: float = 2.0
     """Instants a second of the second comparison, Hz."""
     max_delay_ms: float = 1000.0
-    """From capture to Ack, in the second comparison."""
+    """Time from capture to Ack, in the second comparison."""
     crf: float = 23.0
-    """Of the first comparison."""
+    """CRF of the first comparison."""
     effort: str = "fast"
-    """Of the slice coder: fast, default, thorough."""
+    """Effort of the slice coder: fast, default, thorough."""
     threads: int = 1
-    """Of each process' renderer."""
+    """Threads of each process' renderer."""
     out: Path = Path("out/eval/rig.json")
     """The result file to write."""
     work: Path = Path("out/eval/rig")

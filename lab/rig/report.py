@@ -51,16 +51,17 @@ class SessionRow:
     """Messages that became pictures."""
     psnr_mean_db: float | None
     psnr_lowest_db: float | None
-    """Of the camera that fares worst."""
+    """PSNR of the worst camera."""
     agent_mb: float
     """Peak memory of the vehicle's processes, in sum."""
     instants: int | None = None
-    """How many were shown by every camera; None where sessions know of no instants."""
+    """Number of instants that every camera showed; None where sessions have no instants."""
     spread_p50_ms: float | None = None
-    """From the first to the last picture of an instant, as the server shows them."""
+    """Time from the first to the last picture of an instant, as the server shows them."""
     spread_p99_ms: float | None = None
     most_instants_apart: int | None = None
-    """Between the newest pictures of any two cameras, at any time once each has shown one."""
+    """Largest distance between the newest pictures of two cameras, at any time once each has shown
+    one."""
 
 
 CAMERAS = (

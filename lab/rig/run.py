@@ -103,7 +103,7 @@ Line = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class RigJob:
-    """What is run; see ``lab.rig.EvalRig``."""
+    """The settings of a run; see ``lab.rig.EvalRig``."""
 
     rig: Path
     many: Path | None
@@ -128,13 +128,13 @@ class Case:
 
     @property
     def sessions(self) -> str:
-        """How many there are, in words."""
+        """The number of sessions, in words."""
         return "one" if self.together else "one each"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a case left behind: reports by vehicle, pictures shown, bytes on the link, memory."""
+    """Results of a case: reports by vehicle, pictures shown, bytes on the link, memory."""
 
     lines: Mapping[str, Sequence[Line]]
     pictures: Sequence[TwinPicture]

@@ -36,15 +36,15 @@ class EvalWorld:
     long_empty: str = ""
     """SCENE.toml,DATASET of a longer drive through the unchanged street, for the empty minute."""
     aside_m: tuple[float, ...] = (1.0, 2.0, 3.0)
-    """How far beside the drive views are compared, to its left."""
+    """Distances to the left of the drive at which views are compared."""
     every: int = 6
     """A view is compared at each so-manieth picture of a drive."""
     notices_hz: float = 5.0
     """Rate of the two vehicles of which one is told what the other sees."""
     seconds: float = 30.0
-    """How long each measurement with processes lasts."""
+    """Duration of each measurement with processes."""
     rounds: int = 3
-    """How often ingest is measured without and with a live view, in turn."""
+    """Number of times that ingest is measured without and with a live view, in turn."""
     only: tuple[str, ...] = ()
     """Measure only these parts: objects, dusk, views, cost, notices, ingest. Rows of the others are
     kept if the result file is of this revision."""

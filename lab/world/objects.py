@@ -111,17 +111,17 @@ class AnnotatedDrive:
 
     @property
     def seconds(self) -> float:
-        """How long it lasts, the last picture as long as the others."""
+        """Duration, with the last picture as long as the others."""
         count = len(self.pictures)
         return self.pictures[-1].time_s * count / max(1, count - 1)
 
 
 @dataclass
 class FoundVehicles:
-    """How objects compare with the vehicles of a drive's pictures.
+    """Comparison of objects with the vehicles in a drive's pictures.
 
-    ``errors_m``: of every object in every picture where there is a vehicle at all; ``false``: the
-    objects that were further than ``MATCH_M`` from every vehicle in some picture.
+    ``errors_m``: errors of every object in every picture with a vehicle; ``false``: the objects
+    that were further than ``MATCH_M`` from every vehicle in some picture.
     """
 
     to_find: int = 0

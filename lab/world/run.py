@@ -50,7 +50,7 @@ __all__ = ["run_world"]
 
 MAX_AGE_S = 2.0
 LIVE_AGE_S = 0.1
-"""How old the picture is that a view is composed of."""
+"""Age of the picture that a view is composed of."""
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 LEAST_TOLD_S = 1e-3
 """To this a notice's ``unseen_s`` is rounded."""
@@ -100,8 +100,8 @@ def _kept(out: Path, revision: str) -> dict[str, list[WorldRow]]:
 
 @dataclass(frozen=True)
 class Gain:
-    """By how much a live picture betters a view: everywhere, and in the pixels that changed by the
-    truth, None where hardly any did."""
+    """Gain of a view by a live picture: everywhere, and in the pixels that truly changed, None
+    where hardly any did."""
 
     all_db: float
     changed_db: float | None
@@ -185,7 +185,7 @@ def _changed_rows(gains: Sequence[Gain]) -> list[WorldRow]:
 
 @dataclass(frozen=True, eq=False)
 class TruePictures:
-    """What ``camera`` would see, by the generator: now, and of the empty street."""
+    """The generator's view of ``camera``: now, and of the empty street."""
 
     camera: Camera
     now: Rgb

@@ -1,6 +1,6 @@
-"""What the generator knows of a scene: where its vehicles stand, and what a camera sees of them.
+"""The generator's truth about a scene: positions of its vehicles, and a camera's view of them.
 
-A ``Drive`` goes with it, the pictures that were taken there.
+A ``Drive`` is the scene with the pictures that were taken there.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ LIMITS = ProcessLimits(address_space_bytes=1 << 30)
 REQUEST_CPU_S = 5
 
 DECODER_NAME, FORK_SERVER_NAME = "decoder", "decoder-forks"
-"""What the processes are called in lists of processes (``ps -o comm``)."""
+"""Names of the processes in lists of processes (``ps -o comm``)."""
 
 PR_SET_NAME = 15
 
@@ -85,8 +85,8 @@ MAX_REQUEST_BYTES = 1 + 4 * 16
 
 
 class DecoderCommand(IntEnum):
-    """What a decoder process can be asked for: OPEN with width and height, RESET, and with the
-    lengths of access units FEED, which decodes them, and DECODE, which also returns the last."""
+    """Requests to a decoder process: OPEN with width and height, RESET, and with the lengths of
+    access units FEED, which decodes them, and DECODE, which also returns the last picture."""
 
     OPEN = 1
     FEED = 2

@@ -23,12 +23,13 @@ from rfcore.field.interface import SPLATS
 __all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "read_chunk"]
 
 CHUNK_BYTES = 64 * 1024
-"""As much as a connection's window: what a peer that does not read costs in memory."""
+"""Size of a chunk, the same as a connection's window: the memory that a peer which does not read
+costs."""
 
 MAX_OPEN_FIELDS = 8
 
 TYPICAL_CAMERA = Intrinsics(640, 360, 400.0, 400.0, 320.0, 180.0)
-"""Of the picture that is drawn in advance."""
+"""The camera of the picture that is drawn in advance."""
 
 
 class Store(Protocol):

@@ -1,1 +1,1 @@
-"""Who may use how much of the server: budgets of identities, promised worker time, cameras."""
+"""Limits on the use of the server: budgets of identities, promised worker time, active cameras."""

@@ -1,4 +1,4 @@
-"""What is charged to identities, how much of it there is, and the words for what runs out.
+"""The resources that identities are charged for, their budgets, and the names of limits.
 
 A resource is either *held* (a stream, a decoder) and given back, or *spent* (bytes, worker time)
 and refilled at a rate. Each has a budget for one identity and one for all of them together. One
@@ -34,7 +34,8 @@ __all__ = [
 
 
 class Resource(StrEnum):
-    """What an identity is charged for; label of ``rfedge_server_held`` and ``.._spent_total``."""
+    """A resource that identities are charged for; label of ``rfedge_server_held`` and
+    ``.._spent_total``."""
 
     RPCS = "rpcs"
     """Calls in progress, of every method."""
@@ -49,13 +50,13 @@ class Resource(StrEnum):
     CALLS = "calls"
     """Calls begun."""
     MESSAGES = "messages"
-    """Messages on streams of vehicles, whatever becomes of them."""
+    """Messages on streams of vehicles, parsable or not."""
     BYTES = "bytes"
     """Bytes of these messages."""
     WORKER_SECONDS = "worker_seconds"
     """Time for which frames kept a worker busy, those that were rejected included."""
     REJECTED_SECONDS = "rejected_seconds"
-    """Of this, the time of frames that were rejected, unless their decoder was lost."""
+    """The part of it that went to frames that were rejected, unless their decoder was lost."""
 
 
 HELD = (
@@ -75,7 +76,7 @@ SPENT = (
 
 
 class Limit(StrEnum):
-    """Which limit was exceeded; label of ``rfedge_server_limited_total``."""
+    """The limit that was exceeded; label of ``rfedge_server_limited_total``."""
 
     IDENTITY_RPCS = "identity_rpcs"
     IDENTITY_STREAMS = "identity_streams"
@@ -114,9 +115,9 @@ class Limit(StrEnum):
 
 @dataclass(frozen=True)
 class Budget:
-    """How much of a resource one identity may use, and how much all of them together.
+    """The amounts of a resource that one identity and all of them together may use.
 
-    Held resources are counted; of spent ones this is the amount per second.
+    Amounts of held resources are counts; those of spent ones are per second.
     """
 
     identity: float
@@ -169,7 +170,8 @@ def _within(share: float, wanted: float, total: float, resource: Resource) -> fl
 
 
 RESERVED_BYTES = 384 << 20
-"""Left to the server itself: it takes 280 MiB with the sample's field and four vehicles."""
+"""Memory reserved for the server itself: it takes 280 MiB with the sample's field and four
+vehicles."""
 
 DECODER_BYTES = 48 << 20
 """A decoder process takes 55 MB, half of it shared with the others; the rest are its pictures."""

@@ -1,4 +1,4 @@
-"""Judges what vehicles ask for by everything that limits it, and keeps what each stream was given.
+"""Admission of vehicles: decides what a stream may have, and keeps account of it.
 
 Sans-IO: ``now`` is an argument. ``StreamAccount`` is one stream's side of the ledger: made when the
 stream opens, charged with every message, and closed with it. ``ActiveCameras`` knows which streams
@@ -33,21 +33,21 @@ their periods more."""
 
 
 class CameraSender(Protocol):
-    """A stream, as far as the question of who sends a camera goes."""
+    """A stream, as ``ActiveCameras`` sees it."""
 
     @property
     def agent(self) -> str:
-        """Return which agent process opened the stream; an agent may open several."""
+        """The agent process that opened the stream; an agent may open several."""
 
     def silent_s(self, now: float) -> float:
-        """Return for how long it has sent nothing; 0 while it waits for an answer."""
+        """Return how long it has sent nothing; 0 while it waits for an answer."""
 
     def displace(self, error: LimitExceeded) -> None:
         """End it: another agent sends its cameras from now on."""
 
 
 class ActiveCameras:
-    """Which streams send which cameras, so that two agents never send the same one.
+    """Knows which streams send which cameras, so that two agents never send the same one.
 
     Streams of one agent may share a camera: during a handover between tiles, or when its stream
     broke and is opened again. Another agent is refused while a stream of the first one is alive;
@@ -107,14 +107,14 @@ RATE_MARGIN = 1.25
 """
 
 LEAST_BURST_FRAMES = 8
-"""What a camera may send at once: the frames in flight, each captured anew after a Nack."""
+"""Burst of frames that a camera may send: those in flight, each captured anew after a Nack."""
 
 UNSTATED_HZ = 30 * ASSUMED_HZ
-"""What a camera may send that stated no rate and was granted none: more than any films, and a
+"""Rate limit of a camera that stated no rate and was granted none: more than any films, and a
 quarter of what its identity may send."""
 
 RAW_BYTES_PER_PIXEL = 1.5
-"""Of an I420 picture; a coded one that is larger tells nothing that this would not."""
+"""Size of an I420 picture; a coded one that is larger would be useless."""
 
 
 class CameraMeter:
@@ -163,7 +163,7 @@ class CameraMeter:
 
 
 class StreamAccount:
-    """What one stream holds, and what it is charged for; ``close`` gives everything back.
+    """The resources that one stream holds and is charged for; ``close`` gives everything back.
 
     ``identity`` is charged. Without certificates (``named`` false) that is the connection until a
     Hello names a vehicle.
@@ -247,11 +247,12 @@ class StreamAccount:
         return self._entry.ledger.is_doubtful(self.identity, now)
 
     def expected_s(self) -> float:
-        """Return for how long the next frame will keep a worker busy."""
+        """Return how long the next frame will keep a worker busy."""
         return self._entry.promises.expected_s(self._session_id)
 
     def worked(self, field_id: str, worker_s: float, now: float, *, complete: bool = True) -> None:
-        """Charge the time for which a frame kept a worker busy; not ``complete``: was rejected."""
+        """Charge the time for which a frame kept a worker busy; ``complete``: it was not
+        rejected."""
         self._entry.promises.worked(self._session_id, field_id, worker_s, complete=complete)
         lent = not self._entry.promises.is_crowded
         self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now, lent=lent)
@@ -276,8 +277,8 @@ class StreamAccount:
             self.opening_failed(now)
 
     def take_decoders(self) -> Hold:
-        """Hand over what was granted for decoders to who opens them, and releases it once they
-        are closed: later than the stream, if a decoder hangs."""
+        """Hand over the hold on decoders to the caller, who releases it once they are closed: later
+        than the stream, if a decoder hangs."""
         decoders, self._decoders = self._decoders, None
         self._is_unpaid = True
         if decoders is None:

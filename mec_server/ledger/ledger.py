@@ -1,8 +1,8 @@
-"""The ledger: what each identity holds and has spent, and the only place that says no to more.
+"""The ledger: what each identity holds and has spent; the only place that refuses more.
 
-Sans-IO: ``now`` is an argument. An identity is whom a certificate names; without certificates it
-is a vehicle's name or a connection, and budgets guard against mistakes, not against lies. What is
-refused changes nothing, and the error names the limit and when to try again.
+Sans-IO: ``now`` is an argument. An identity is named by a certificate; without certificates it is a
+vehicle's name or a connection, and budgets guard against mistakes, not against lies. A refusal
+changes nothing, and its error names the limit and when to try again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ at once, for one may be a mistake; after each further one the identity waits, tw
 time."""
 
 HELD_RETRY_S = 1.0
-"""When to try again for what others hold: nobody knows when they give it back."""
+"""Delay before trying again for what others hold: nobody knows when they give it back."""
 
 BURST_S = 1.0
 LONGER_BURST_S = {Resource.WORKER_SECONDS: 5.0, Resource.REJECTED_SECONDS: 2.0}
@@ -97,7 +97,7 @@ class TokenBucket:
 
 @dataclass
 class Account:
-    """What one identity holds and has spent, and what went wrong for it."""
+    """The resources that one identity holds and has spent, and its recent failures."""
 
     spent: dict[Resource, TokenBucket]
     held: dict[Resource, int] = field(default_factory=lambda: dict.fromkeys(HELD, 0))
@@ -106,7 +106,7 @@ class Account:
     opens_again_s: float = float("-inf")
 
     def barred_until_s(self) -> float:
-        """Return until when its packets cost too many decoders."""
+        """Return the time until which it is barred because its packets cost too many decoders."""
         lost = self.lost_decoders_s
         return lost[0] + BARRED_S if len(lost) == MAX_LOST_DECODERS else float("-inf")
 
@@ -179,7 +179,7 @@ class Ledger:
         return account.held[resource] if account is not None else 0
 
     def most_held(self, resource: Resource) -> int:
-        """Return how much the identity holds that holds most."""
+        """Return the largest amount that one identity holds."""
         return max(
             (account.held[resource] for account in tuple(self._accounts.values())), default=0
         )
@@ -190,7 +190,7 @@ class Ledger:
 
     @property
     def identities(self) -> int:
-        """How many identities there are accounts of."""
+        """The number of identities that have an account."""
         return len(self._accounts)
 
     # --- what is held

@@ -17,7 +17,7 @@ from mec_server.ledger.ledger import TokenBucket
 __all__ = ["LINES_PER_S", "LINE_BURST", "LogLimiter", "PeerLog"]
 
 LINES_PER_S, LINE_BURST = 5.0, 100.0
-"""What a vehicle causes that reconnects twice a second, and all that one has to say at once."""
+"""Enough for a vehicle that reconnects twice a second, and for all that one has to say at once."""
 
 MOST_IDENTITIES = 1024
 """Identities that are remembered; the one that was silent longest is forgotten."""

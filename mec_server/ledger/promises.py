@@ -55,7 +55,7 @@ HEADROOM = 1.25
 
 @dataclass
 class Promise:
-    """What one stream was promised. ``cost_s``: worker time for each of its frames."""
+    """The worker time promised to one stream. ``cost_s``: worker time for each of its frames."""
 
     identity: str
     pixels: int
@@ -84,8 +84,10 @@ class Promise:
 
 
 class Promises:
-    """Shares out the time of ``workers``, less what ``limits`` keeps back, between identities of
-    which each has a right to no more than ``share``."""
+    """Shares out the time of ``workers``, less the reserve of ``limits``, between identities.
+
+    Each identity has a right to no more than ``share``.
+    """
 
     def __init__(self, limits: AdmissionLimits, workers: int, share: float) -> None:
         self._limits = limits
@@ -100,14 +102,15 @@ class Promises:
 
     @property
     def promised_share(self) -> float:
-        """Return what is promised, of what may be; above 1 when frames take longer than before."""
+        """Return the promised share of the worker time; above 1 when frames take longer than
+        before."""
         if not self._capacity:
             return 0.0
         return sum(stream.promised for stream in tuple(self._streams.values())) / self._capacity
 
     @property
     def reduced(self) -> int:
-        """Return how many streams have less than they asked for."""
+        """Return the number of streams that have less than they asked for."""
         return sum(s.granted_hz < s.requested_hz for s in tuple(self._streams.values()))
 
     def promised_to(self, identity: str) -> float:
@@ -115,7 +118,7 @@ class Promises:
         return sum(s.promised for s in self._streams.values() if s.identity == identity)
 
     def identities(self) -> set[str]:
-        """Return who was promised something."""
+        """Return the identities that were promised something."""
         return {stream.identity for stream in self._streams.values()}
 
     def enter(

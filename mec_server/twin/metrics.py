@@ -89,7 +89,7 @@ class TwinMetrics:
             "rfedge_twin_nats_published", "Pictures handed to NATS, by encoding.", ("encoding",)
         )
         self.nats_missed: Callable[[], int] = int
-        """How many pictures were not published so far; read at each scrape."""
+        """Returns the number of pictures that were not published so far; read at each scrape."""
         make.collector(NATS_DROPPED, _Counted(NATS_DROPPED, lambda: self.nats_missed()))
         for kind in NOTICE_KINDS:
             self.notices.labels(kind)

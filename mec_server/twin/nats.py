@@ -1,8 +1,9 @@
-"""A server's part of a twin of many servers: its pictures, and where its vehicles are, over NATS.
+"""A server's part of a twin of many servers: its pictures, and its vehicles' locations, over NATS.
 
 It is a consumer of the twin like any other: one mailbox holds at most the newest picture of a
-camera, so what NATS takes too slowly is missed, counted, and delays nobody. Nothing is published
-that the server has not authenticated and decoded. ``rfcore.wire.nats`` says what goes where.
+camera, so pictures for which NATS is too slow are missed, counted, and delay nobody. Nothing is
+published that the server has not authenticated and decoded. ``rfcore.wire.nats`` defines the
+subjects.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ FLUSH_S: Final = 3
 BATCH: Final = 16
 """Pictures after which it is waited until NATS has taken them."""
 PLACES_EVERY_S: Final = 2.0
-"""How often the places are written again, well before they expire."""
+"""Period at which locations are written again, well before they expire."""
 FAREWELL_S: Final = 1.0
 POLL_S: Final = 0.01
 AGAIN_S: Final = 0.1
@@ -99,15 +100,18 @@ class TwinPublisher:
         await self._link.run(self._serve)
 
     async def say_farewell(self) -> None:
-        """Wait until what has arrived is published, for a moment: departures of a server that
-        stops. Where NATS is not reached they expire."""
+        """Wait for a moment until the departures of a server that stops are published.
+
+        Where NATS is not reached they expire.
+        """
         with suppress(TimeoutError):
             async with asyncio.timeout(FAREWELL_S):
                 while self._link.is_connected and len(self._mailbox):
                     await asyncio.sleep(POLL_S)
 
     async def _serve(self, client: Client) -> None:
-        """Publish over one connection; what is known is told again to whoever listens now."""
+        """Publish over one connection, beginning with the newest pictures for those who listen
+        now."""
         await client.subscribe(wanted_subject(None), cb=self._hear_wish)
         self._tell_again()
         await together(self._publish(client), self._keep_places(client))
@@ -125,7 +129,7 @@ class TwinPublisher:
         self._arrived.set()
 
     def _encodings(self) -> tuple[PictureEncoding, ...]:
-        """Return how pictures are published now: without, and as somebody wants them."""
+        """Return the encodings that are published now: none, and those that somebody wants."""
         since = time.monotonic() - WANTED_S
         wanted = (each for each, at_s in self._wanted.items() if at_s >= since)
         return tuple(dict.fromkeys((PictureEncoding.NONE, *wanted)))
@@ -144,7 +148,7 @@ class TwinPublisher:
                 await self._publish_view(client, entry)
 
     def _take(self) -> ReceivedPicture | Departure | None:
-        """Return what is to be published next."""
+        """Return the next entry to publish."""
         entry = self._mailbox.take()
         if isinstance(entry, ReceivedPicture):
             self._newest[entry.key] = entry
@@ -195,7 +199,7 @@ class TwinPublisher:
         )
 
     def _places(self) -> Mapping[str, VehicleLocation]:
-        """Return where the vehicles of this server are, each in its newest session."""
+        """Return the locations of this server's vehicles, each in its newest session."""
         places: dict[str, VehicleLocation] = {}
         for view in self._newest.values():
             place = self._place(view)
@@ -212,7 +216,7 @@ class TwinPublisher:
 
 
 class NatsServices:
-    """What a server does over NATS: it exchanges fields, and publishes pictures of vehicles.
+    """The exchange of fields with other servers over NATS, and the publication of pictures there.
 
     ``failed`` is called with an unexpected exception of either; it begins anew then.
     """
@@ -271,14 +275,15 @@ class NatsServices:
 
 
 class PlaceRecords:
-    """The places of this server's vehicles in the bucket, as far as no other server's is newer."""
+    """Writes the locations of this server's vehicles to the bucket, unless another server's are
+    newer."""
 
     def __init__(self, bucket: KeyValue) -> None:
         self._bucket = bucket
         self._written: dict[str, tuple[VehicleLocation, int]] = {}
 
     async def write(self, places: Mapping[str, VehicleLocation]) -> None:
-        """Write ``places``, and remove what was written before of vehicles that are not there."""
+        """Write ``locations``, and remove those written before of vehicles that are gone."""
         for vehicle_id in self._written.keys() - places.keys():
             _, revision = self._written.pop(vehicle_id)
             with suppress(BadRequestError):  # another server has written since
@@ -287,7 +292,7 @@ class PlaceRecords:
             await self._put(place)
 
     async def _put(self, place: VehicleLocation) -> None:
-        """Write one place in place of what this server wrote, or of an older one."""
+        """Write one location, in place of an older one."""
         key, value = key_of(place.vehicle_id), place.encode()
         _, revision = self._written.pop(place.vehicle_id, (place, 0))
         try:

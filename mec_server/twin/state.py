@@ -40,15 +40,15 @@ RENDERS_BYTES = 96 * 2**20
 """Memory for renders that are kept: enough for 21 cameras of 640x360."""
 
 PAST_S = 5.0
-"""How long ago the moment of a view may be."""
+"""Greatest age of the moment of a view."""
 KEPT_S, KEPT_EVERY_S = PAST_S + DEFAULT_AGE_S, 0.2
-"""How long pictures are kept for such views, and the least time between two of one camera."""
+"""Time for which pictures are kept for such views, and the least time between two of one camera."""
 MOST_PAST_BYTES = 128 << 20
 """Memory for past pictures: 18 cameras of 640 x 360, or 2 of 1920 x 1080; with more cameras the
 past is shorter."""
 
 Covers = Callable[[str, str], bool]
-"""Whether a consumer may see the pictures of a vehicle (id) against a field (id)."""
+"""Decides whether a consumer may see the pictures of a vehicle (id) against a field (id)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class Mailbox:
 
     @property
     def missed(self) -> int:
-        """How many pictures were replaced before they were taken, of all cameras ever."""
+        """The number of pictures that were replaced before they were taken, of all cameras ever."""
         return self._entries.missed
 
     def put(self, entry: Entry) -> bool:

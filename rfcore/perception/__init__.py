@@ -1,1 +1,2 @@
-"""What pictures show beside a field: objects, contacts with the ground, views composed of both."""
+"""Perception: what camera pictures show beyond a field: objects, their contacts with the ground,
+and views composed of both."""

@@ -1,26 +1,27 @@
-"""The street as it is now, from any viewpoint: a field's render and what live pictures change.
+"""Composition of the street as it is now, from any viewpoint: a field's render with the changes
+that live pictures show.
 
-Without clock, sockets or threads. What is carried is not a picture but its difference from the
+Without clock, sockets or threads. A live picture is carried to a view as its difference from the
 field's own render at the picture's pose, brought into the light of the field and limited to regions
 that differ by more than noise: where nothing changed, a view is the render to the bit, and detail
 that resampling would soften comes from the render. ``rfcore.native.live_view`` defines what a
 change is, and which camera vouches for which pixel of a view.
 
-A camera's word weighs, beside angle, resolution and distance, by
+Beside angle, resolution and distance, a camera's weight depends on
 
 * age: 1 at capture, 0 at the age from which pictures vouch for nothing, and
 * trust: 1 less the share of the picture that disagrees with the field; little where the picture
   would fit the field elsewhere than at its pose (``rfcore.perception.misplacement``).
 
-Pictures of one vehicle share its word where several of them vouch: a rig has no more to say than
-one camera.
+Pictures of one vehicle share a weight where several of them vouch for a pixel: a rig counts no more
+than one camera.
 
-Things that stand or move in the street and are not in the field come as patches at their own depth
-(``rfcore.perception.patches``), once they were found (``rfcore.perception.contacts``).
+Objects that the field lacks come as patches at their own depth (``rfcore.perception.patches``),
+once they were found (``rfcore.perception.contacts``).
 
 A camera of which more than half disagrees with the field, as with a wrong pose, vouches for
-nothing. In the last half of its time a difference fades, so that a vehicle that is gone leaves
-nothing standing.
+nothing. In the last half of its time a difference fades, so that a vehicle that left leaves nothing
+behind.
 """
 
 from __future__ import annotations
@@ -71,47 +72,50 @@ __all__ = [
 T = TypeVar("T")
 
 MOST_CAMERAS, MOST_OF_ONE = 4, 2
-"""Live pictures carried to one view, and how many of one vehicle if there are others."""
+"""Most live pictures carried to one view, and most of one vehicle while there are others."""
 LOOKED_AT_M = (3.0, 6.0, 12.0, 24.0)
-"""How far away on a view's axis that is which pictures are compared by."""
+"""Distances of the points on a view's axis by which pictures are ranked."""
 
 MOST_DISAGREEMENT = 0.5
-"""Share of a picture; one that differs in more is taken to be somewhere else."""
+"""Share of a picture that may differ from the field; one that differs in more has a wrong pose."""
 
 LOOKED_FOR_M, SOMETHING = 25.0, 0.2
-"""Things further away may be too small to be found."""
+"""Objects further away may be too small to be found; less than this share of a box is no object."""
 
 DAY_LEVELS, CONTRAST_POWER, LEAST_BRIGHTNESS = 85.0, 3, 0.5
-"""The mean of what a field shows by day. At dusk the sample's has 0.78 of it; with limits half as
-high as by day 91 % of the vehicles are found there and nothing where nothing stands, with those of
-the day 77 %, with 0.78 of those 85 %."""
+"""Mean level of a field by day, and how contrast falls with it. At dusk the sample's mean is 0.78
+of the day's; with limits half as high as by day 91 % of the vehicles are found there and no false
+ones, with those of the day 77 %, with 0.78 of those 85 %."""
 
 MISPLACED_RAD, MISPLACED_TRUST = 0.025, 0.25
-"""A picture that would fit the field that far away has a wrong pose. On the sample's drives it is
-0.005 at most at the right poses, 0.013 with errors of 5 cm and 0.1 degree together, 0.024 with 10
-cm and 0.2 degrees, and from 0.038 on with 0.5 m and 1 degree. With a trust of 0.3 an honest picture
-behind it and older left up to 11 % of what it shows wrong, with 0.25 at most 4 %."""
+"""A picture that would fit the field better by this angle has a wrong pose. On the sample's drives
+the angle is 0.005 at most at the right poses, 0.013 with errors of 5 cm and 0.1 degree together,
+0.024 with 10 cm and 0.2 degrees, and from 0.038 on with 0.5 m and 1 degree. With a trust of 0.3 an
+honest picture behind it and older left up to 11 % of its content wrong, with 0.25 at most 4 %."""
 SURE_TRUST = 0.93
-"""Pictures with more are not asked where else they would fit: on the sample's empty drive those at
-the right pose have 0.98, with errors of 0.5 m and 1 degree 0.89 at most."""
+"""Pictures of more trust are not aligned with the field: on the sample's empty drive those at the
+right pose have 0.98, with errors of 0.5 m and 1 degree 0.89 at most."""
 GREEN = 1
 
 MOST_GAIN = 4.0
 SAME_GAIN, SAME_OFFSET = 0.05, 4.0
-"""A fitted light within these is the field's own."""
+"""A fitted light with less gain and offset than this is the field's own."""
 FIT_STEP_PX = 4
 FIT_ROUNDS = 4
 
 MOST_LIVE_PX = 960 * 540
-"""Live pictures larger than this are shrunk by a whole factor first."""
+"""Live pictures larger than this are scaled down by a whole factor first."""
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Where a picture shows a thing: rows and columns, ``mask`` bool in them; ``z_m`` along the
-    optical axis, and ``foot_m``, where it stands on the tile's ground."""
+    """The outline of an object in a picture.
+
+    ``box``: rows and columns, ``mask``: bool in them; ``z_m``: depth along the optical axis;
+    ``foot_m``: the point on the tile's ground where it stands.
+    """
 
     box: tuple[slice, slice]
     mask: Mask
@@ -121,13 +125,13 @@ class Outline:
 
 @dataclass(frozen=True, eq=False)
 class LivePicture:
-    """What one camera's picture changes in the field.
+    """The difference of one camera's picture from the field.
 
     ``difference``: float32 [H, W, 3], levels in the light of the field, 0 where there is only
     noise. ``depth``: the field's, float32 [H, W]. ``trust``: 0 (outvoted) to 1. ``changed``: bool
-    [H, W], where it is more likely a change than noise. ``colour``: the field's, float32 [H, W, 3].
-    ``brightness``: of the field's light, 1 by day: things differ less from the street where both
-    are darker. ``things``: cut out of all of these (``with_things``).
+    [H, W], true where a change is more likely than noise. ``colour``: the field's, float32 [H, W,
+    3]. ``brightness``: that of the field's light, 1 by day: objects differ less from the street
+    where both are darker. ``things``: the objects cut out of all of these (``with_things``).
     """
 
     camera: Camera
@@ -140,11 +144,11 @@ class LivePicture:
     things: tuple[StandingPatch, ...] = ()
 
     def rules_out(self, at_m: tuple[float, float, float], width_m: float, height_m: float) -> bool:
-        """Return whether it should show a thing whose foot is at ``at_m`` and does not.
+        """Return whether the picture should show an object with its foot at ``at_m`` and does not.
 
-        It should where the foot is in the picture, within ``LOOKED_FOR_M``, and no surface of the
-        field is before it; it does not where less than ``SOMETHING`` of the thing's box differs
-        from the field. A picture that is outvoted says nothing.
+        It should if the foot is in the picture, within ``LOOKED_FOR_M``, and no surface of the
+        field hides it; it does not if less than ``SOMETHING`` of the object's box differs from the
+        field. A picture that is outvoted rules nothing out.
         """
         k = self.camera.intrinsics
         x_m, y_m, z_m = self.camera.cam_from_world().apply(at_m)
@@ -165,11 +169,12 @@ class LivePicture:
 
 @dataclass(frozen=True, eq=False)
 class ComposedView:
-    """``rgb`` uint8 [H, W, 3]; ``depth`` of the field or of a thing before it, float32 [H, W],
-    metres, 0: nothing hit.
+    """A composed view.
 
-    ``age_s``: float32 [H, W], of the picture that vouches for a pixel, infinite where none does.
-    ``shares``: of the pixels, for each live picture.
+    ``rgb`` uint8 [H, W, 3]; ``depth`` of the field or of an object before it, float32 [H, W],
+    metres, 0 where nothing is hit. ``age_s``: float32 [H, W], age of the picture that vouches for a
+    pixel, infinite where none does. ``shares``: the share of the pixels that each live picture
+    vouches for.
     """
 
     rgb: Rgb
@@ -179,7 +184,7 @@ class ComposedView:
 
 
 def shrunk(picture: I420, intrinsics: Intrinsics) -> tuple[Rgb, Intrinsics]:
-    """Return a picture as RGB, and its camera; a large one as means of whole squares of pixels."""
+    """Return a picture as RGB and its camera; large ones are averaged over squares of pixels."""
     rgb = rgb_from_i420(picture)
     factor = 1
     while intrinsics.width_px * intrinsics.height_px > MOST_LIVE_PX * factor * factor:
@@ -196,7 +201,8 @@ def shrunk(picture: I420, intrinsics: Intrinsics) -> tuple[Rgb, Intrinsics]:
 
 
 def live_picture(camera: Camera, rgb: Rgb, view: View) -> LivePicture:
-    """Return what ``rgb``, uint8 [H, W, 3], changes in the field that shows ``view`` there."""
+    """Return the difference of ``rgb``, uint8 [H, W, 3], from ``view``, the field's render
+    there."""
     covered = view.opacity > COVERED
     light = _light_of(rgb, view, covered)
     brightness = _brightness_of(view, covered)
@@ -213,7 +219,7 @@ def live_picture(camera: Camera, rgb: Rgb, view: View) -> LivePicture:
 
 
 def _brightness_of(view: View, covered: Mask) -> float:
-    """Return what share of the day's contrast the field has where it has a surface, 1 at most."""
+    """Return the share of the day's contrast that the field has on its surfaces, 1 at most."""
     step = slice(None, None, FIT_STEP_PX)
     seen = view.colour[step, step][covered[step, step]]
     if not len(seen):
@@ -231,8 +237,8 @@ def _is_misplaced(camera: Camera, rgb: Rgb, view: View, light: Light, depth: F32
 
 
 def with_things(picture: LivePicture, outlines: Sequence[Outline]) -> LivePicture:
-    """Return ``picture`` with what is inside of ``outlines`` as patches: there it shows no surface
-    of the field."""
+    """Return ``picture`` with the objects in ``outlines`` as patches, without depth of the field
+    there."""
     if not outlines:
         return picture
     depth = picture.depth.copy()
@@ -292,7 +298,7 @@ def compose(
 def _standing(
     pictures: Sequence[tuple[LivePicture, float]], sources: Sequence[LiveSource]
 ) -> Iterator[StandingPatch]:
-    """Yield the things of the pictures that vouch for anything, with what each weighs."""
+    """Yield the objects of the pictures that vouch for anything, with their weights."""
     for number, ((picture, _), source) in enumerate(zip(pictures, sources, strict=True)):
         if source.weight > 0:
             for each in picture.things:
@@ -305,9 +311,11 @@ def nearest(
     pose_of: Callable[[T], Pose | None],
     vehicle_of: Callable[[T], Hashable] = id,
 ) -> list[T]:
-    """Return the pictures of known pose that see most of what ``camera`` sees, the best first; of
-    equal ones, and of those that see nothing of it, the nearest. Of one vehicle there are at most
-    ``MOST_OF_ONE`` while others are left."""
+    """Return the pictures of known pose that see most of the view of ``camera``, the best first.
+
+    Of equal ones, and of those that see nothing of it, the nearest come first. There are at most
+    ``MOST_OF_ONE`` of one vehicle while others are left.
+    """
     ranked = []
     for order, picture in enumerate(pictures):
         pose = pose_of(picture)
@@ -327,8 +335,11 @@ def nearest(
 
 
 def _overlap(view: Pose, live: Pose) -> float:
-    """Return how well a camera at ``live`` vouches for what one at ``view`` looks at, 0 to 1: the
-    mean over points on its axis, as ``rfcore.native.live_view`` weighs, whatever hides them."""
+    """Return how well a camera at ``live`` vouches for the view of one at ``view``, 0 to 1.
+
+    It is the mean over points on the view's axis, weighted as in ``rfcore.native.live_view``,
+    without regard to occlusion.
+    """
     cam_from_view, weights = live.inverse().compose(view), []
     origin_m = np.array(cam_from_view.translation_m)
     for ahead_m in LOOKED_AT_M:
@@ -342,8 +353,8 @@ def _overlap(view: Pose, live: Pose) -> float:
 
 
 def _light_of(rgb: Rgb, view: View, covered: Mask) -> Light:
-    """Return the light that ``rgb`` was taken in, by the field's: a gain and an offset for each
-    channel, fitted by least squares to the pixels that fit best."""
+    """Return the light of ``rgb`` relative to the field's: a gain and an offset for each channel,
+    fitted by least squares to the pixels that fit best."""
     step = slice(None, None, FIT_STEP_PX)
     inside = covered[step, step]
     render = np.rint((view.colour[step, step] * np.float32(255)).clip(0, 255))
@@ -359,7 +370,7 @@ def _light_of(rgb: Rgb, view: View, covered: Mask) -> Light:
 def _line_through(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
     """Return gain and offset of y over x, least squares over the half that fits best.
 
-    Where x hardly varies there is no gain to be seen, and none is taken.
+    Where x hardly varies no gain can be found, and it is 1.
     """
     if len(x) < 16:
         return 1.0, 0.0

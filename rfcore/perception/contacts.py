@@ -1,7 +1,8 @@
-"""Where things stand that one picture shows and the field does not have.
+"""Detection of objects that one picture shows and the field lacks, by their contacts with the
+ground.
 
-A pixel is *marked* when it belongs to a change (``rfcore.native.live_view``) and differs by more
-than ``THING_LEVELS``, times the field's ``brightness``, itself. The lowest pixel of a run of marked
+A pixel is *marked* when it belongs to a change (``rfcore.native.live_view``) and itself differs by
+more than ``THING_LEVELS``, times the field's ``brightness``. The lowest pixel of a run of marked
 ones in a column is a *contact* with the ground when
 
 * the field's surface just below it is level ground (z is up) within ``REACH_M``,
@@ -11,25 +12,25 @@ ones in a column is a *contact* with the ground when
   it belongs to that, whether that stands on level ground or not, nor above what is marked at the
   picture's lower edge, whose foot is outside of the picture.
 
-Left out thereby is mostly the field's own error, at the edges of facades, trees and roofs.
+This leaves out most of the field's own errors, at the edges of facades, trees and roofs.
 
-A thing also changes the ground before it, by its shadow: all colours are darkened alike, to
-``SHADOW`` of what the field has, within ``SHADOW_TINT`` of each other. (Under a vehicle it is
-darker than that.) A contact in a shadow is moved up to where that ends, if that is no more than
-``SHADOW_M`` of ground further away.
+An object also changes the ground before it, by its shadow: all colours are darkened alike, to
+``SHADOW`` of the field's, within ``SHADOW_TINT`` of each other. (Under a vehicle it is darker than
+that.) A contact in a shadow is moved up to the shadow's end, if that is no more than ``SHADOW_M``
+of ground further away.
 
 A contact is as far away as the ray through it meets the ground (``rfcore.perception.ground``).
 Where the field's surface is not near that, its depth counts.
 
-Contacts of neighbouring columns that are near each other on the ground are one thing. One longer
-than ``LONG_M`` is taken for a row of parked vehicles, whose gaps cannot be seen from afar, and cut
-every ``PIECE_M`` along the axis of the world in which it is longer: the cuts stay where they are
-from one picture to the next. A thing stands where the middle of its near side is.
+Contacts of neighbouring columns that are near each other on the ground belong to one object. One
+longer than ``LONG_M`` is taken for a row of parked vehicles, whose gaps cannot be seen from afar,
+and cut every ``PIECE_M`` along the axis of the world in which it is longer: the cuts stay where
+they are from one picture to the next. The position of an object is the middle of its near side.
 
-How well that is known: across the view to ``ACROSS_PX`` and ``SIDE_M``, for the side that is seen
-changes with the view; along it to what ``CONTACT_PX`` of the ground are worth, which grows with the
-square of the distance over the camera's height. A near side that the picture's edge cuts off is
-anywhere within ``CUT_M``.
+Its uncertainty across the view is ``ACROSS_PX`` and ``SIDE_M``, since the visible side changes with
+the view; along the view it is the length of ``CONTACT_PX`` of ground, which grows with the square
+of the distance over the camera's height. A near side that the picture's edge cuts off is uncertain
+by ``CUT_M``.
 """
 
 from __future__ import annotations
@@ -50,32 +51,33 @@ __all__ = ["Detection", "OutlinedDetection", "cut_out", "detect", "find"]
 
 THING_LEVELS = 22.0
 """On the sample's empty drive nothing is found, nor with 18. With 30, 86 % of the vehicles of
-another drive are found instead of 88 %, and a hole in a van is another thing."""
+another drive are found instead of 88 %, and a hole in a van counts as another object."""
 BELOW_PX, GROUND_PX = 2, 6
-"""How far below a contact the ground is looked at, and how much further its slope."""
+"""Rows below a contact at which the ground is sampled, and further rows for its slope."""
 MOST_SLOPE = 0.4
 """Sine of the steepest way from there to the contact."""
 SHADOW, SHADOW_TINT, SHADOW_M, BORDER_PX = (0.4, 0.9), 0.12, 2.0, 3
 """On the sample's drive among vehicles, and on two other arrangements of them, the 95th percentile
-of what objects are off falls from 1.35, 1.5 and 1.0 m to 0.75, 1.3 and 0.9 m."""
+of the position error falls from 1.35, 1.5 and 1.0 m to 0.75, 1.3 and 0.9 m."""
 REACH_M = 32.0
 LOOKED_AT_M, LEAST_MARKED_M = 1.5, 0.3
 TALL_M = 2.2
 OUTLINE_M = 2.6
-"""How far above its foot a thing's picture is looked for: a van is that tall."""
+"""Height above the foot that an object's outline may have: a van is that tall."""
 NEAR_GROUND_M = 0.4
 
 LINK_PX, LINK_M, LINK_PER_M = 6, 0.3, 0.04
 LONG_M, PIECE_M = 5.5, 4.5
 LEAST_PX, LEAST_COLUMNS, LEAST_WIDTH_M = 200, 4, 0.4
-"""What is narrower is mostly a piece of a vehicle between others: with 0.15 m two more objects are
-none in 2.4 s, and not one more vehicle is found."""
+"""Narrower detections are mostly pieces of a vehicle between others: with 0.15 m two more objects
+are false in 2.4 s, and not one more vehicle is found."""
 NEAR_SHARE, SAME_SIDE = 0.1, 1.1
-"""The near side: the nearest tenth of a thing's contacts, and those up to so many times as far."""
+"""The near side is the nearest tenth of an object's contacts, and those up to this factor
+further."""
 MIDDLE_SHARE = 0.5
 CONTACT_PX, ACROSS_PX, SIDE_M, CUT_M = 1.0, 2.0, 0.25, 1.5
 LEAST_EYE_M = 0.5
-"""Of the camera above the foot: none is lower."""
+"""Least height of a camera above the foot."""
 
 Vec3 = tuple[float, float, float]
 F64 = NDArray[np.float64]
@@ -85,9 +87,13 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Detection:
-    """A thing in one picture: its foot relative to the tile's origin, seen from ``eye_m``, its size
-    as the camera sees it, and of how many marked pixels it is. The sigmas are those of its foot on
-    the ground, along the view and across it. ``trust``: in the picture (``LivePicture``)."""
+    """An object in one picture.
+
+    ``at_m``: its foot, relative to the tile's origin; ``eye_m``: the camera; ``width_m`` and
+    ``height_m``: its size as the camera sees it; ``marked_px``: its marked pixels. The sigmas are
+    those of its foot on the ground, along the view and across it. ``trust``: that of the picture
+    (``LivePicture``).
+    """
 
     at_m: Vec3
     eye_m: Vec3
@@ -100,14 +106,17 @@ class Detection:
 
     @property
     def distance_m(self) -> float:
-        """How far its foot is from the camera."""
+        """Distance of its foot from the camera."""
         return math.dist(self.at_m, self.eye_m)
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Contacts of one picture, by column, lowest first: rows and columns [N], ``z_m`` [N] along the
-    optical axis, ``marked_m`` [N] how much is marked above, ``at_m`` [N, 3] in the world."""
+    """Contacts of one picture, by column, lowest first.
+
+    Rows and columns [N]; ``z_m`` [N]: depth along the optical axis; ``marked_m`` [N]: marked length
+    above; ``at_m`` [N, 3]: position in the world.
+    """
 
     rows: Index
     columns: Index
@@ -127,14 +136,14 @@ class Contacts:
 
 @dataclass(frozen=True, eq=False)
 class OutlinedDetection:
-    """A thing in one picture, and where the picture shows it."""
+    """A detection and its outline in the picture."""
 
     detection: Detection
     outline: Outline
 
 
 def find(picture: LivePicture, ground: FieldGround) -> list[OutlinedDetection]:
-    """Return what ``picture`` shows that the field does not have, from left to right. ``ground`` is
+    """Return the objects in ``picture`` that the field lacks, from left to right; ``ground`` is
     that field's."""
     if picture.trust == 0:
         return []
@@ -149,19 +158,19 @@ def find(picture: LivePicture, ground: FieldGround) -> list[OutlinedDetection]:
 
 
 def detect(picture: LivePicture, ground: FieldGround) -> list[Detection]:
-    """Return the things alone."""
+    """Return the detections without outlines."""
     return [each.detection for each in find(picture, ground)]
 
 
 def cut_out(picture: LivePicture, ground: FieldGround) -> tuple[LivePicture, list[Detection]]:
-    """Return ``picture`` with its things as patches (``with_things``), and where they stand."""
+    """Return ``picture`` with its objects as patches (``with_things``), and their detections."""
     found = find(picture, ground)
     things = with_things(picture, [each.outline for each in found])
     return things, [each.detection for each in found]
 
 
 def _outline(picture: LivePicture, thing: Contacts, detection: Detection) -> Outline:
-    """Return all between the contacts of a thing and the uppermost change above each.
+    """Return the region between the contacts of an object and the uppermost change above each.
 
     Between columns with contacts, feet and tops lie on straight lines.
     """
@@ -236,7 +245,7 @@ def _above_shadow(picture: LivePicture, marked: Mask, rows: Index, columns: Inde
 
 
 def _is_level(picture: LivePicture, rows: Index, columns: Index, surface_m: F64) -> Mask:
-    """Return whether the way from further below to the surface below a contact is level."""
+    """Return whether the ground between two rows below a contact is level."""
     further = np.minimum(rows + GROUND_PX, picture.depth.shape[0] - 1)
     z_m = picture.depth[further, columns].astype(np.float64)
     before_m = points_of(picture.camera, further, columns, z_m)
@@ -262,7 +271,7 @@ def _ground_z_m(
 
 
 def _marked_m(marked: Mask, rows: Index, columns: Index, z_m: F64, focal_px: float) -> F64:
-    """Return how much is marked within LOOKED_AT_M above contacts, metres [N]."""
+    """Return the marked length within LOOKED_AT_M above contacts, metres [N]."""
     counted = np.zeros((marked.shape[0] + 1, marked.shape[1]), np.int32)
     np.cumsum(marked, axis=0, out=counted[1:])
     px_per_m = focal_px / np.maximum(z_m, 0.1)
@@ -271,8 +280,10 @@ def _marked_m(marked: Mask, rows: Index, columns: Index, z_m: F64, focal_px: flo
 
 
 def _free_above(marked: Mask, edge_m: NDArray[np.float32], focal_px: float) -> Index:
-    """Return, for each column, the row above which a thing at the picture's lower edge ends; the
-    number of rows where there is none. ``edge_m``: depths of the lowest row."""
+    """Return, for each column, the row above which an object at the picture's lower edge ends.
+
+    That is the number of rows where there is none. ``edge_m``: depths of the lowest row.
+    """
     height = len(marked)
     px_per_m = focal_px / np.maximum(edge_m.astype(np.float64), 0.1)
     free_above = np.full(marked.shape[1], height)
@@ -300,7 +311,7 @@ def _not_above_another(contacts: Contacts, focal_px: float, free_above: Index) -
 
 
 def _things(contacts: Contacts) -> Iterator[Index]:
-    """Yield which contacts belong to each thing, from left to right."""
+    """Yield the contacts of each object, from left to right."""
     numbers = _linked(contacts)
     for number in dict.fromkeys(numbers.tolist()):
         members = np.flatnonzero(numbers == number)
@@ -316,7 +327,7 @@ def _things(contacts: Contacts) -> Iterator[Index]:
 
 
 def _linked(contacts: Contacts) -> Index:
-    """Return a number for each contact, the same for those of one thing: that of its first."""
+    """Return a number for each contact, the same for those of one object: that of its first."""
     count = len(contacts.rows)
     numbers = np.arange(count)
     firsts = np.searchsorted(contacts.columns, contacts.columns - LINK_PX)
@@ -338,7 +349,7 @@ def _linked(contacts: Contacts) -> Index:
 
 
 def _standing(thing: Contacts, picture: LivePicture) -> Detection | None:
-    """Return where a thing stands, ``None`` for one that is too small to be one."""
+    """Return an object's position and size, None for one that is too small."""
     if len(np.unique(thing.columns)) < LEAST_COLUMNS:
         return None
     camera = picture.camera
@@ -369,7 +380,7 @@ def _standing(thing: Contacts, picture: LivePicture) -> Detection | None:
 
 
 def _nearest_to(middle: float, columns: Index) -> Index:
-    """Return which ``MIDDLE_SHARE`` of columns are nearest to ``middle``: the mean of many contacts
-    is better known than the one there."""
+    """Return the ``MIDDLE_SHARE`` of columns that are nearest to ``middle``: the mean of many
+    contacts is more certain than a single one."""
     count = max(1, round(MIDDLE_SHARE * len(columns)))
     return np.argsort(np.abs(columns - middle), kind="stable")[:count]

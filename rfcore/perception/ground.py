@@ -33,21 +33,22 @@ STEP_M, STEPS = 4.0, 6
 SIDE_STEP_M, HEIGHT_STEP_M, TURN_STEP_RAD = 2.0, 0.1, math.pi / 8
 LOOKING_DOWN_RAD = 0.25
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 192, 128, 96.0
-"""In a view of half that size the depth of a far row mixes metres of road."""
+"""Size of the views; in one of half that size the depth of a far row mixes metres of road."""
 OPAQUE = 0.9
 NEAR_M = (3.0, 8.0)
 ASIDE_M = 3.5
 BELOW_M = (0.8, 3.0)
-"""Lower than the camera by so much is what may be ground."""
+"""Range of heights below the camera that may be ground."""
 NTH = 16
-"""Of the points of a view every so-manieth is kept."""
+"""Every so-many-th point of a view is kept."""
 LEAST_POINTS = 30
 LOWER = 0.3
-"""With 0.25 to 0.4 what objects are off differs little, on the sample's drive and on two others of
-other vehicles: at the 95th percentile 0.7 to 1.0, 0.8 to 1.0 and 1.3 to 1.4 m."""
+"""With 0.25 to 0.4 the position errors of objects differ little, on the sample's drive and on two
+others of other vehicles: at the 95th percentile 0.7 to 1.0, 0.8 to 1.0 and 1.3 to 1.4 m."""
 ROUNDS, LEAST_ERROR_M = 12, 0.02
 LEVEL_WEIGHT = 1.0
-"""Metres squared, of each point: where the ground ahead is short, its slope is 0."""
+"""Weight of level ground, metres squared for each point: where the ground ahead is short, its slope
+is 0."""
 MOST_VIEWS = 512
 
 F64 = NDArray[np.float64]
@@ -57,7 +58,7 @@ LatticePoint = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class GroundPlane:
-    """``height_m`` of the ground at ``below`` (x, y), and its slopes along x and y."""
+    """A plane: ``height_m`` of the ground at ``below`` (x, y), and its slopes along x and y."""
 
     below: tuple[float, float]
     height_m: float
@@ -68,8 +69,8 @@ class GroundPlane:
         return np.asarray(self.height_m + (at_m - self.below) @ np.array(self.slopes))
 
     def depths_m(self, eye_m: tuple[float, float, float], rays: F64) -> F64:
-        """Return how far along rays [N, 3] from ``eye_m`` the plane is, infinite where it is not
-        ahead."""
+        """Return the distance of the plane along rays [N, 3] from ``eye_m``, infinite where it is
+        not ahead."""
         falls = rays[:, 2] - rays[:, :2] @ np.array(self.slopes)
         above_m = eye_m[2] - self.heights_m(np.array([eye_m[:2]]))[0]
         return np.asarray(np.where(falls < -1e-6, above_m / np.maximum(-falls, 1e-6), np.inf))
@@ -83,7 +84,7 @@ class FieldGround:
         self._views: OrderedDict[LatticePoint, F64] = OrderedDict()
 
     def warm_up(self, at_m: tuple[float, float, float]) -> None:
-        """Draw one place, so that the next ones take no memory first and half as long again."""
+        """Draw one place, so that the memory for drawing is there and the next ones are faster."""
         self._seen(_place_at(*at_m, 0.0))
 
     def ahead_of(self, camera: Camera) -> GroundPlane | None:

@@ -1,17 +1,17 @@
-"""How far off the field a picture stands: by its pose it is there, by its pixels elsewhere.
+"""Estimates by which angle a picture is misplaced: its pose says one place, its pixels another.
 
-A picture whose pose is wrong shows things wherever the field has edges, and one error can hide
-another: half a metre to the right and a degree to the left leave most of a street where it was. So
-the picture is not judged by how much of it differs, but by where it would fit: direct alignment
-(Lucas and Kanade; on depth, Kerl et al., ICRA 2013) of the picture with the field's render, both as
-means of ``WIDE`` squares across. With R, Z the render and its depth, X = Z (x, y, 1) a point of it,
-I the picture and M the motion from the pose that is stated to the one that fits::
+A picture whose pose is wrong differs wherever the field has edges, and one error can hide another:
+half a metre to the right and a degree to the left leave most of a street where it was. So the
+picture is not judged by how much of it differs, but by where it would fit: direct alignment (Lucas
+and Kanade; on depth, Kerl et al., ICRA 2013) of the picture with the field's render, both as means
+of ``WIDE`` squares across. With R, Z the render and its depth, X = Z (x, y, 1) a point of it, I the
+picture and M the motion from the stated pose to the one that fits::
 
     r = I(pi(M X)) - R,    J = grad I dpi/dX [1 | -[X]x],    delta = argmin sum w (r - J delta)^2
 
-with weights of Cauchy at 1.5 times the median of the absolute r: what is not in the field hardly
-counts. A picture is misplaced by the angle that a quarter of its points would move by or more, seen
-from the camera; by 0 where they would not fit ``BETTER`` there.
+with weights of Cauchy at 1.5 times the median of the absolute r, so that objects that are not in
+the field hardly count. The misplacement is the angle that a quarter of the points would move by or
+more, seen from the camera; it is 0 where they would not fit ``BETTER`` there.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ from rfcore.motion import quaternion_from_vector
 __all__ = ["misplacement_rad"]
 
 WIDE = 80
-"""In squares of 1/80 of the width errors of 5 degrees are within reach."""
+"""Squares across a picture; with 80, errors of 5 degrees can be found."""
 ROUNDS = 24
-"""At the right pose or nearly so 4 to 12 are done, at a wrong one all; after 12 a few of those were
-not half-way yet."""
+"""Most rounds. At the right pose or nearly so 4 to 12 suffice, a wrong one takes all; after 12 a
+few of those were not half-way yet."""
 CONVERGED = 1e-3
 """Metres and radians; 1e-4 takes half as long again at the right pose and tells nothing more."""
 SHARE = 0.75
 BETTER = 0.95
-"""Of the median residual before: else the picture fits nowhere, as one that is full of a van."""
+"""A fit must lower the median residual to this share, or the picture fits nowhere, as one that a
+van fills."""
 LEAST_POINTS = 100
 NEAREST_M = 0.3
 DAMPING = 1e-3
@@ -50,11 +51,11 @@ def misplacement_rad(
     depth: NDArray[np.float32],
     intrinsics: Intrinsics,
 ) -> float:
-    """Return how far from where it should be the picture shows what it shows.
+    """Return the angle by which the picture is misplaced.
 
     ``levels`` and ``render``: one channel of the picture and of the field's render in its light,
-    float32 [H, W]; ``depth``: the field's, metres, 0 where it has no surface. 0 for a picture too
-    small, or with too little of the field in it, to tell.
+    float32 [H, W]; ``depth``: the field's, metres, 0 where it has no surface. 0 for a picture that
+    is too small, or has too little of the field in it, to tell.
     """
     size = max(1, round(intrinsics.width_px / WIDE))
     cells = _Cells.of(levels, render, depth, intrinsics, size)

@@ -1,23 +1,24 @@
-"""Things that cameras see and the field does not have, followed over time and over cameras.
+"""Tracking of objects that cameras see and the field lacks, over time and over cameras.
 
 Without clock, sockets or threads, and deterministic: the same pictures in the same order give the
 same objects.
 
-A detection (``rfcore.perception.contacts``) belongs to the nearest object not further away than
-``GATE_M`` and a part of its distance from the camera, for that is how its error grows; greedy, the
-nearest pair first. Where an object is, and whether it moves, is what its sightings of the last
-``REMEMBERED_S`` say together (``rfcore.perception.triangulation``), those of all cameras alike.
+A detection (``rfcore.perception.contacts``) is assigned to the nearest object within ``GATE_M`` and
+a part of its distance from the camera, since its error grows with that; greedy, the nearest pair
+first. The position and velocity of an object are estimated from its sightings of the last
+``REMEMBERED_S`` by all cameras (``rfcore.perception.triangulation``).
 
-What counts is a vehicle at an instant, not a picture: the cameras of a rig see one moment together,
-and with one pose. Pictures of a vehicle within ``SAME_INSTANT_S`` are of one instant.
+A vehicle counts once at an instant, however many pictures it sends: the cameras of a rig see one
+moment together, and with one pose. Pictures of a vehicle within ``SAME_INSTANT_S`` are of one
+instant.
 
-One is *confirmed* by a third instant, by a second one where that is of another vehicle, and at once
-where its instants have ``LARGE_PX`` marked pixels of it. It is *missed* by a picture that should
-show it and shows the field there instead (``LivePicture.lacks``), at an instant at which no other
-picture of the vehicle shows it; its *confidence* is the share of the last ``LOOKS`` instants that
-did not miss it, less after few. It is *doubtful* while no vehicle shows it whose pictures of it are
-trusted by ``LEAST_TRUST`` in the mean, as with a wrong pose, which shows things wherever the field
-has edges. It is forgotten ``FORGOTTEN_S`` after its last.
+An object is *confirmed* by a third instant, by a second one of another vehicle, and at once by
+``LARGE_PX`` marked pixels. A picture *misses* it if it should show the object and shows the field
+there instead (``LivePicture.rules_out``), and no other picture of the vehicle at that instant shows
+it. Its *confidence* is the share of the last ``LOOKS`` instants that did not miss it, and lower
+after few. It is *doubtful* while no vehicle shows it whose pictures have a mean trust of
+``LEAST_TRUST``: a picture of a wrong pose shows objects wherever the field has edges. It is
+forgotten ``FORGOTTEN_S`` after its last picture.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ __all__ = [
 GATE_M = 1.5
 GATE_PER_M = 0.1
 REMEMBERED_S, MOST_REMEMBERED = 1.0, 12
-"""Sightings from which its place is told: of so many instants."""
+"""Age and number of instants whose sightings place an object."""
 SAME_INSTANT_S = 0.01
 LOOKS = 40
 MOST_SPEED_MPS = 60.0
@@ -54,7 +55,7 @@ CONFIRMED_BY = 3
 LARGE_PX = 600
 """On the sample's empty drive the largest contact of all has 248."""
 SURE_BY = 4
-"""Instants that saw an object until nothing is missing from its confidence."""
+"""Number of instants after which the confidence is not lowered any more."""
 REPEAT_S = 0.5
 LEAST_RANGE_M = 0.1
 LEAST_TRUST = 0.7
@@ -65,15 +66,18 @@ Vec3 = tuple[float, float, float]
 CameraKey = tuple[str, str]
 """(vehicle id, camera id)"""
 RulesOut = Callable[[Vec3, float, float], bool]
-"""Whether a picture should show a thing of a width and height (metres) at a place, and does not."""
+"""Tests whether a picture should show an object at a place, of a width and height in metres, and
+does not."""
 
 
 @dataclass(frozen=True)
 class StreetObject:
-    """A thing that the field does not have: see twin.proto. ``at_m`` is the foot of the side that
-    is seen, relative to the tile's origin; ``seen_by``: (vehicle id, camera id). ``is_doubtful``:
-    only vehicles show it whose pictures fit the field badly, as with a wrong pose. ``label``: what
-    it is, empty where no detector says."""
+    """An object that the field lacks: see twin.proto.
+
+    ``at_m``: the foot of its visible side, relative to the tile's origin; ``seen_by``: (vehicle id,
+    camera id). ``is_doubtful``: only vehicles show it whose pictures fit the field badly, as with a
+    wrong pose. ``label``: a detector's name for it, empty without a detector.
+    """
 
     object_id: int
     at_m: Vec3
@@ -89,13 +93,13 @@ class StreetObject:
 
 
 def rules_nothing_out(_at_m: Vec3, _width_m: float, _height_m: float) -> bool:
-    """Say of nothing that it is not there."""
+    """Rule nothing out."""
     return False
 
 
 @dataclass(frozen=True)
 class _Instant:
-    """A vehicle at a moment."""
+    """A vehicle at one moment."""
 
     vehicle_id: str
     time_s: float
@@ -107,8 +111,8 @@ class _Instant:
 
 @dataclass
 class _Look:
-    """What one instant says of an object. ``marked_px``: the most in one of its pictures; none: it
-    missed it."""
+    """The pictures of an object at one instant. ``marked_px``: the most in one of them; 0 for a
+    miss."""
 
     instant: _Instant
     marked_px: int = 0
@@ -125,9 +129,12 @@ class _TimedDetection:
 
 @dataclass
 class FollowedObject:
-    """A thing over time. ``seen``: instants that showed it; ``cameras``: when each saw it last;
-    ``marked_px``: of how many marked pixels it is in all of them; ``labels``: how often a detector
-    called it what."""
+    """An object over time.
+
+    ``seen``: the number of instants that showed it; ``cameras``: when each saw it last;
+    ``marked_px``: its marked pixels over all instants; ``labels``: how often a detector gave each
+    name.
+    """
 
     object_id: int
     at_m: Vec3
@@ -159,8 +166,7 @@ class FollowedObject:
         return best < LEAST_TRUST
 
     def confidence(self, now: float) -> float:
-        """Return 0 to 1: less after few instants, by how many missed it, and while nobody sees
-        it."""
+        """Return 0 to 1: lower after few instants, after misses, and while no camera sees it."""
         fresh = max(0.0, 1.0 - max(0.0, now - self.last_s) / FORGOTTEN_S)
         missed = sum(not look.marked_px for look in self._looks)
         agreed = 1.0 - missed / max(1, len(self._looks))
@@ -168,7 +174,7 @@ class FollowedObject:
 
     @property
     def label(self) -> str:
-        """What it was called most often, empty where nobody said."""
+        """The most frequent name, empty without a detector."""
         return max(sorted(self.labels), key=lambda label: self.labels[label], default="")
 
     def seen_by(self, now: float) -> list[CameraKey]:
@@ -184,7 +190,7 @@ class FollowedObject:
         return x, y, z
 
     def report(self, now: float) -> StreetObject:
-        """Return what is known of it, where it is now."""
+        """Return it as of ``now``."""
         return StreetObject(
             object_id=self.object_id,
             at_m=self.at(now),
@@ -200,7 +206,7 @@ class FollowedObject:
         )
 
     def take(self, detection: Detection, camera: CameraKey, time_s: float) -> None:
-        """Move to where a picture of ``camera`` and those before it show it."""
+        """Update the position by a detection in a picture of ``camera``."""
         look = self._look(camera, time_s)
         self.seen += not look.marked_px
         marked_px = max(look.marked_px, detection.marked_px, 1)
@@ -221,11 +227,11 @@ class FollowedObject:
         self.cameras[camera] = time_s
 
     def miss(self, camera: CameraKey, time_s: float) -> None:
-        """Take in that a picture should show it and does not."""
+        """Note that a picture should show it and does not."""
         self._look(camera, time_s)
 
     def _look(self, camera: CameraKey, time_s: float) -> _Look:
-        """Return what the instant of a picture says of it, so far."""
+        """Return the look of a picture's instant at it, which may begin with this picture."""
         for look in reversed(self._looks):
             if look.instant.is_of(camera, time_s):
                 return look
@@ -249,7 +255,7 @@ class FollowedObject:
 
 
 def _sighting(seen: _TimedDetection, vote: float) -> Sighting:
-    """Return on the ground what a picture says of where an object is, and how much that counts."""
+    """Return the sighting on the ground that a detection stands for."""
     detection = seen.detection
     x_m, y_m = (detection.at_m[axis] - detection.eye_m[axis] for axis in (0, 1))
     range_m = max(math.hypot(x_m, y_m), LEAST_RANGE_M)
@@ -265,7 +271,7 @@ def _sighting(seen: _TimedDetection, vote: float) -> Sighting:
 
 
 class ObjectTracker:
-    """Follows things through the pictures of all cameras of a place."""
+    """Tracks objects through the pictures of all cameras of a place."""
 
     def __init__(self) -> None:
         self._objects: list[FollowedObject] = []
@@ -330,8 +336,9 @@ class ObjectTracker:
 
 
 class ObjectReports:
-    """What one consumer is told of a tracker: whenever ``now`` is called, and again at ``again_s``
-    while there is anything, so that what nobody sees any more goes where no pictures come."""
+    """Reports a tracker's objects to one consumer: whenever ``now`` is called, and again at
+    ``again_s`` while there are any, so that objects that nobody sees disappear where no pictures
+    come."""
 
     def __init__(self) -> None:
         self.tracker = ObjectTracker()

@@ -1,14 +1,15 @@
-"""Things that stand or move in the street as textured patches at their own depth.
+"""Objects as textured patches that stand in the street at their own depth.
 
-What a picture shows of a thing that the field does not have (``rfcore.perception.contacts``) is cut
-out of it and stands upright where the thing meets the ground, parallel to the picture's plane: from
-aside it moves before what is behind it. Without patches its pixels would be carried as if painted
-on the surface behind; and that surface is hidden from the camera, which vouches for nothing there.
+The pixels of an object that the field lacks (``rfcore.perception.contacts``) are cut out of the
+picture and stand upright where the object meets the ground, parallel to the picture's plane: from
+another viewpoint they move before the background. Without patches these pixels would be carried as
+if painted on the surface behind; and that surface is hidden from the camera, which vouches for
+nothing there.
 
-A patch is drawn where no surface of the field and no other patch is nearer, from ahead of it
-rather than from aside (``LEAST_COSINE`` between the rays of the two cameras to its middle). Of
-several pictures' patches of one thing, their feet within ``SAME_M``, that of the camera that weighs
-most counts.
+A patch is drawn where no surface of the field and no other patch is nearer, and only from ahead of
+it rather than from aside (``LEAST_COSINE`` between the rays of the two cameras to its middle). Of
+several pictures' patches of one object, with feet within ``SAME_M``, the one of the largest weight
+is drawn.
 """
 
 from __future__ import annotations
@@ -44,8 +45,11 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class StandingPatch:
-    """A patch of a thing whose foot is at ``foot_m`` on the tile's ground, from picture ``source``,
-    of which so much counts (``weight``) and is left to be seen (``fade``, 0 to 1)."""
+    """A patch of an object whose foot is at ``foot_m`` on the tile's ground.
+
+    ``source``: the number of its picture; ``weight``: the picture's weight; ``fade``: 0 to 1, how
+    much of it remains visible.
+    """
 
     patch: Patch
     foot_m: tuple[float, float]
@@ -56,8 +60,8 @@ class StandingPatch:
 
 @dataclass(frozen=True, eq=False)
 class _PatchInView:
-    """A thing in rows and columns ``box`` of a view; ``from_view`` maps points of the view's axes
-    into those of its camera."""
+    """A patch in rows and columns ``box`` of a view; ``from_view`` maps points of the view's axes
+    into those of the patch's camera."""
 
     thing: StandingPatch
     from_view: Pose
@@ -66,13 +70,13 @@ class _PatchInView:
 
 
 def in_front_of(view: View) -> F32:
-    """Return up to which depth something is before the surfaces of ``view``, float32 [H, W]."""
+    """Return the depth up to which an object hides the surfaces of ``view``, float32 [H, W]."""
     reach = view.depth * np.float32(1 + RELATIVE_DEPTH) + np.float32(ABSOLUTE_DEPTH_M)
     return np.where(view.opacity > COVERED, reach, np.float32(np.inf))
 
 
 def draw_standing(canvas: Canvas, things: Iterable[StandingPatch]) -> None:
-    """Draw the things that are seen in the view of ``canvas``, the furthest first."""
+    """Draw the patches that are visible in the view of ``canvas``, the furthest first."""
     world_from_view = canvas.camera.world_from_cam
     motions: dict[int, Pose] = {}
     seen: list[_PatchInView] = []
@@ -87,7 +91,7 @@ def draw_standing(canvas: Canvas, things: Iterable[StandingPatch]) -> None:
 
 
 def _once(things: Iterable[StandingPatch]) -> Sequence[StandingPatch]:
-    """Return, of several pictures' patches of one thing, that of the picture that weighs most."""
+    """Return one patch for each object: that of the picture of the largest weight."""
     kept: list[StandingPatch] = []
     for each in sorted(things, key=lambda it: -it.weight):
         others = (k for k in kept if k.source != each.source)
@@ -97,7 +101,7 @@ def _once(things: Iterable[StandingPatch]) -> Sequence[StandingPatch]:
 
 
 def _place_in(camera: Camera, thing: StandingPatch, from_view: Pose) -> _PatchInView | None:
-    """Return where a thing is in the view of ``camera``, None if it is not seen there."""
+    """Return the position of a patch in the view of ``camera``, None if it is not visible."""
     k, in_patch = camera.intrinsics, _corners(thing.patch)
     rotation = np.array(from_view.rotation_matrix())
     corners = (in_patch - from_view.translation_m) @ rotation

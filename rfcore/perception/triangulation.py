@@ -1,22 +1,22 @@
-"""Where a thing is on the ground, from sightings of several moments, places and cameras.
+"""Position of an object on the ground, from sightings of several moments, places and cameras.
 
-A *sighting* says in which direction a camera saw the thing and, where it saw its foot, how far away
-that is. The two err very differently: the direction by pixels, the range by what pixels of the
-ground are worth there, which grows with the square of the distance. Directions that cross place the
-thing by themselves (parallax). With a camera at c, the unit direction n and its normal m, time t_i
-of each sighting, and the thing at p with velocity v at the time t of the newest::
+A *sighting* is the direction in which a camera saw the object and, if it saw its foot, the
+distance. The two errors differ much: the direction is wrong by pixels, the range by the length of
+ground that a pixel covers there, which grows with the square of the distance. Directions that cross
+place the object by themselves (parallax). With a camera at c, the unit direction n and its normal
+m, time t_i of each sighting, and the object at p with velocity v at the time t of the newest::
 
     q = p + v (t_i - t) - c
     n . q = range  +- range_sigma,      m . q = 0  +- bearing_sigma * distance,      v = 0  +- SPEED
 
 which is linear least squares for p and v; the distance of a sighting without a range is that of the
-last round (Stansfield, Proc. IEE 94 IIIA, 1947). A thing stands, v = 0, unless moving explains its
-sightings better by ``EVIDENCE``.
+last round (Stansfield, Proc. IEE 94 IIIA, 1947). An object stands, v = 0, unless moving explains
+its sightings better by ``EVIDENCE``.
 
-A sighting that the others contradict, like that of a camera with a wrong pose, is outvoted: the one
-that is furthest off is left out while that is more than ``LIMIT_SIGMAS`` and most remain. Sightings
-of one vehicle at one moment share one ``vote``, which weighs their squared errors as well: they err
-together where its pose does.
+A sighting that the others contradict, like that of a camera with a wrong pose, is outvoted: the
+worst one is left out while its error is more than ``LIMIT_SIGMAS`` and most remain. Sightings of
+one vehicle at one moment share one ``vote``, which also weights their squared errors: they err
+together where the vehicle's pose does.
 """
 
 from __future__ import annotations
@@ -33,30 +33,29 @@ from rfcore.errors import InvalidInput
 __all__ = ["Placement", "Sighting", "placed"]
 
 SPEED_MPS = 10.0
-"""How fast things move, one standard deviation along each axis."""
+"""Standard deviation of an object's velocity along each axis."""
 EVIDENCE = 4.0
-"""By how much the sum of squared errors, in sigmas, falls for a thing that moves: what stands, with
+"""Decrease of the sum of squared errors, in sigmas, that shows motion: a standing object, with
 errors as stated, is taken for moving in 14 % of cases (chi-square, two degrees of freedom)."""
 LIMIT_SIGMAS = 4.0
 TIE = 1e-9
-"""Halves of all votes that differ by less, relatively, are equal: shares are rounded."""
+"""Relative tolerance of a tie between two halves of the votes: shares are rounded."""
 LEAST_TO_MOVE, LEAST_SPAN_S = 3, 0.05
-"""Sightings, and the time between the first and the last, that can tell of a velocity."""
+"""Least number of sightings, and least time between the first and the last, for a velocity."""
 BEARING_ROUNDS = 6
 MOST_SIGMA_M = 1000.0
-"""What is known less well than this along some direction has no place."""
+"""A position that is less certain than this along some direction is no position."""
 
 F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """A thing seen from ``eye_m`` (x, y) at ``time_s``, in the direction ``bearing_rad`` from x
-    towards y, ``range_m`` away on the ground; ``None``: its foot was not seen. ``vote``: how much
-    it counts.
+    """An object seen from ``eye_m`` (x, y) at ``time_s``.
 
-    Raises ``InvalidInput`` for a value that is not finite, or a sigma, range or vote that is not
-    above 0.
+    ``bearing_rad``: its direction from x towards y; ``range_m``: its distance on the ground, None
+    if its foot was not seen; ``vote``: its weight. Raises ``InvalidInput`` for a value that is not
+    finite, or a sigma, range or vote that is not above 0.
     """
 
     time_s: float
@@ -83,8 +82,11 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where a thing is at the time of its newest sighting: x, y, and the covariance [2, 2] of that;
-    a velocity of exactly 0 for what stands; ``outvoted``: which sightings were left out."""
+    """Position and velocity of an object at the time of its newest sighting.
+
+    ``covariance_m2``: of the position, [2, 2]; the velocity of a standing object is exactly 0;
+    ``outvoted``: indices of the sightings that were left out.
+    """
 
     at_m: tuple[float, float]
     velocity_mps: tuple[float, float]
@@ -93,10 +95,10 @@ class Placement:
 
 
 def placed(sightings: Sequence[Sighting]) -> Placement:
-    """Return where a thing is that was seen so.
+    """Return the placement of an object from its sightings.
 
-    Raises ``InvalidInput`` where that is nowhere: no sightings, or directions without a range that
-    do not cross, or behind a camera.
+    Raises ``InvalidInput`` where there is none: without sightings, and for directions without a
+    range that do not cross, or cross behind a camera.
     """
     if not sightings:
         raise InvalidInput("sightings", "there are none; one with a range or two directions place")
@@ -145,13 +147,14 @@ class _Rays:
 
     @property
     def can_tell_velocity(self) -> bool:
-        """Whether there are enough, over time."""
+        """Whether there are enough sightings over time."""
         return len(self.elapsed_s) >= LEAST_TO_MOVE and self.elapsed_s.min() <= -LEAST_SPAN_S
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """x, y and velocity [4] at the newest time; ``off``: of each sighting kept, in sigmas."""
+    """A fit: x, y and velocity [4] at the newest time; ``off``: error of each kept sighting, in
+    sigmas."""
 
     state: F64
     covariance_m2: F64
@@ -161,7 +164,7 @@ class _Fit:
 
 
 def _majority(rays: _Rays, *, moves: bool) -> _Fit:
-    """Return the fit to those sightings that do not contradict it, at least most of them."""
+    """Return the fit to the sightings that agree with it, at least most of them."""
     kept, total = np.arange(len(rays.votes)), float(rays.votes.sum())
     while True:
         fit = _fitted(rays[kept], kept, moves=moves)
@@ -182,7 +185,7 @@ def _majority(rays: _Rays, *, moves: bool) -> _Fit:
 
 
 def _fitted(rays: _Rays, kept: NDArray[np.intp], *, moves: bool) -> _Fit:
-    """Return the least squares of these sightings."""
+    """Return the least-squares fit to these sightings."""
     seen = ~np.isnan(rays.range_m)
     distance_m = np.where(seen, rays.range_m, 1.0)
     for _ in range(1 if seen.all() else BEARING_ROUNDS):

@@ -30,29 +30,30 @@ class Twin:
     """Look at a server's street, or at one field, in a browser, until Ctrl-C."""
 
     target: Annotated[str | None, Positional, arg(metavar="HOST:PORT|FIELD")] = None
-    """Where mec-server listens; or a field (archive, name, .ply, .spz) to look at without one."""
+    """Address of a mec-server; or a field (archive, name, .ply, .spz) to look at without one."""
     nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
     """Show what all servers publish over this NATS (docs/how-to/servers.md), instead of one
     server."""
     nats_login: Annotated[Path | None, arg(metavar="FILE")] = None
     """With --nats: file of one line, USER:PASSWORD or a token."""
     http: Annotated[str, ADDRESS] = "127.0.0.1:8080"
-    """Where to serve the page; port 0 takes a free one. For browsers elsewhere give a token."""
+    """Address to serve the page at; port 0 takes a free one. For browsers elsewhere give a
+    token."""
     token: Annotated[str | None, arg(metavar="TOKEN")] = None
-    """What a browser must know, as /?token=TOKEN; at least 16 characters. Default: the
+    """Secret that a browser must send, as /?token=TOKEN; at least 16 characters. Default: the
     environment variable RFEDGE_TWIN_TOKEN, which a list of processes does not show."""
     drive: Annotated[Path | None, DATASET] = None
     """With a field: show the pictures of this drive beside the field's renders."""
     follow: bool = False
-    """With a field archive: show it anew each time that it is written."""
+    """Show a field archive again each time that it is written."""
     until_exit_of: Annotated[int | None, arg(metavar="PID")] = None
     """End when this process has ended, too."""
     rate_hz: float = 10.0
-    """With a drive: pictures a second."""
+    """Pictures a second of a drive."""
     threads: int = 1
     """Threads that render a field for comparison."""
     fields: Annotated[Path, FOLDER] = Path("out/twin/fields")
-    """With servers: where their fields are kept."""
+    """Folder for fields of servers."""
     tls_cert: Annotated[Path | None, PEM] = None
     """Certificate of this consumer (PEM), for a server or a NATS that wants one."""
     tls_key: Annotated[Path | None, PEM] = None

@@ -68,7 +68,7 @@ def _finite(psnr_db: float) -> float | None:
 log = structlog.get_logger()
 
 UNWATCHED_EVERY_S = 1.0
-"""How often a picture of a camera is compared that nobody looks at in full."""
+"""Period at which the picture of a camera is compared that nobody looks at in full."""
 IDLE_S = 0.05
 
 

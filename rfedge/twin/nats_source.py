@@ -1,7 +1,7 @@
 """Fields and pictures of many servers from one NATS, for the page and for ``rfedge watch``.
 
-``SharedTwin`` decides which server shows a vehicle (``rfcore.wire.nats``); it knows neither NATS
-nor a clock. While NATS is away what was shown stays until it expires.
+``SharedTwin`` decides which server shows a vehicle (``rfcore.wire.nats``); it has neither NATS nor
+a clock. While NATS is away the page keeps showing what it has until that expires.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ log = structlog.get_logger()
 EXPIRE_EVERY_S: Final = 0.5
 CONNECT_S: Final = 10.0
 FIELDS_AGAIN_S: Final = 2.0
-"""How soon a field that was not in NATS is looked for again."""
+"""Delay before a field that was not in NATS is tried again."""
 
 TwinMessage = TwinPicture | Departure
 
@@ -69,14 +69,14 @@ class _Shown:
 
 
 class SharedTwin:
-    """The cameras that all servers show, those of a vehicle from where it is. ``now``: seconds."""
+    """The cameras that all servers show, each vehicle's at its newest session. ``now``: seconds."""
 
     def __init__(self) -> None:
         self.places = VehicleLocations()
         self._shown: dict[CameraKey, _Shown] = {}
 
     def hear(self, place: VehicleLocation, message: TwinMessage, now: float) -> bool:
-        """Take in what a server published; return whether it is to be shown."""
+        """Take in a published message; return whether it is to be shown."""
         key = message.key
         if isinstance(message, TwinPicture):
             if not self.places.hear(place, now):
@@ -91,8 +91,8 @@ class SharedTwin:
         return True
 
     def expire(self, now: float) -> list[Departure]:
-        """Return the cameras of vehicles that no server tells of any more, and those that a vehicle
-        had in an older session alone."""
+        """Return departures of cameras that no server shows any more, or only an older session
+        does."""
         self.places.expire(now)
         gone = [key for key, shown in self._shown.items() if self._is_over(key[0], shown, now)]
         for key in gone:
@@ -107,12 +107,14 @@ class SharedTwin:
 
 
 Take = Callable[[TwinMessage, VehicleLocation | None], None]
-"""What is done with a picture and where its vehicle is; a departure comes without."""
+"""Takes a picture and its vehicle's location; a departure comes without."""
 
 
 class NatsReader:
-    """Calls ``take`` with what is to be shown of ``subscription``, each vehicle once, and ``say``
-    with whether NATS is there and what to tell of it."""
+    """Reads ``subscription`` from NATS and calls ``take`` with each vehicle's messages, once.
+
+    ``say`` is called with whether NATS is connected, and a detail.
+    """
 
     def __init__(
         self,
@@ -146,7 +148,7 @@ class NatsReader:
             await asyncio.sleep(WANTED_EVERY_S)
 
     async def _follow_places(self, client: Client) -> None:
-        """Hear of every vehicle that some server has, also of those that send nothing now."""
+        """Follow the locations of all vehicles, also of those that send nothing now."""
         watcher = await (await places_bucket(client)).watchall(ignore_deletes=True)
         async for entry in watcher:
             if entry is not None:
@@ -177,8 +179,11 @@ class NatsReader:
 def published_message(
     subject: str, header: str, body: bytes
 ) -> tuple[VehicleLocation, TwinMessage]:
-    """Return what a server published; raise ``ProtocolError`` unless all three are of one vehicle,
-    which is what NATS gives permissions by."""
+    """Return the location and message that a server published.
+
+    Raises ``ProtocolError`` unless subject, header and message name one vehicle: NATS gives
+    permissions by the subject.
+    """
     try:
         message = twin_message_from_wire(twin_pb2.WatchResponse.FromString(body))
     except DecodeError as error:
@@ -191,8 +196,10 @@ def published_message(
 
 
 class NatsSource:
-    """Tells ``scene`` what all servers show. ``fields``: where fetched fields are kept; ``threads``
-    render each of them."""
+    """Shows in ``scene`` what all servers show.
+
+    ``fields``: folder for fetched fields; ``threads`` render each of them.
+    """
 
     def __init__(
         self,
@@ -263,9 +270,10 @@ class NatsSource:
 
 
 class NatsPictures:
-    """The same for a thread that waits for one message after the other (``rfedge watch``).
+    """The pictures of all servers for a thread that waits for one message after the other (``rfedge
+    watch``).
 
-    What is not taken is replaced by newer pictures of the same camera.
+    Pictures that are not taken are replaced by newer ones of the same camera.
     """
 
     def __init__(self, servers: NatsServers) -> None:

@@ -1,4 +1,4 @@
-"""What the page shows: fields where they lie, cameras with their newest pictures.
+"""The content of the page: fields where they lie, cameras with their newest pictures.
 
 ``TwinScene`` turns changes into messages, ``Board`` keeps the newest message of every key for each
 browser. Without event loop or clock. Positions sent to the page are metres relative to the first

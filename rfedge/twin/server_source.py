@@ -44,13 +44,13 @@ log = structlog.get_logger()
 RETRY_S = 0.5
 FIELDS_EVERY_S = 5.0
 OBJECTS_AGAIN_S = 0.5
-"""How soon a field that was placed, or a wish to see objects, is noticed."""
+"""Period of checks for fields to show objects of."""
 VIEW_EVERY_S = 0.25
-"""A view takes the server a render and more; a browser gets at most so many."""
+"""Least time between two views of a browser: a view takes the server a render and more."""
 FRESHNESS_STEP_MS = 10
 FIELD_ALONE = 255
-"""Freshness of pixels that no live picture vouches for; others: their age in steps of the above, at
-most 254."""
+"""Freshness of pixels that no live picture vouches for; that of others is their age in steps of the
+above, at most 254."""
 
 
 class ServerSource:

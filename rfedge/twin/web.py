@@ -56,7 +56,7 @@ LONGEST_REQUEST_BYTES: Final = 4096
 HEARTBEAT_S: Final = 10.0
 EXIT_SEEN_S: Final = 1.0
 STALLED_S: Final = 10.0
-"""A browser that takes nothing for so long is let go; it connects again by itself."""
+"""A browser that takes nothing for this long is disconnected; it connects again by itself."""
 HEALTH: Final = "/healthy"
 """Answers without a token, to whoever restarts a service that does not; tells nothing else."""
 COOKIE: Final = "rfedge-twin"
@@ -72,7 +72,8 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 @dataclass(frozen=True)
 class WebSettings:
-    """Where to listen, and the token a browser must know (``None``: none, loopback alone)."""
+    """The address to listen at, and the token that a browser must send (None: none, loopback
+    only)."""
 
     address: Address
     token: str | None = None
@@ -120,7 +121,7 @@ class MovingView(Protocol):
 
 
 class LiveSource(Protocol):
-    """What can show more than pictures: objects, and the street from anywhere."""
+    """A source that also shows objects, and the street from anywhere."""
 
     def open_view(self, send: Callable[[Message], object]) -> MovingView:
         """Return a view for one browser; ``send`` takes its messages."""
@@ -178,7 +179,7 @@ class TwinWeb:
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse strangers; tell browsers what the page may do."""
+        """Refuse browsers without the token; set the headers that restrict the page."""
         if request.path != HEALTH and not self._is_known(request):
             raise web.HTTPForbidden(text="this page needs its token: /?token=...\n")
         response = await handler(request)
@@ -274,7 +275,7 @@ class TwinWeb:
 
 
 class _User:
-    """What one browser's user looks at."""
+    """The interests of one browser's user: a camera, objects, a live view."""
 
     def __init__(self, comparer: Comparer, live: LiveSource | None, reader: Reader) -> None:
         self._comparer = comparer
@@ -310,12 +311,12 @@ class _User:
 
 
 def wish(text: str) -> Select | Look | ShowObjects:
-    """Return what a browser's message asks for; raise ``ValueError``, which ``InvalidInput`` is,
-    for what the page does not send.
+    """Return the request in a browser's message; raise ``ValueError`` (which ``InvalidInput`` is)
+    for anything that the page does not send.
 
-    One member: ``select`` is null or [vehicle, camera]; ``objects`` a boolean; ``look`` null, or
-    the ``field`` and a camera relative to its tile: ``translation_m``, ``rotation_wxyz``, and
-    ``intrinsics`` by the names of ``Intrinsics``.
+    A message has one member: ``select`` is null or [vehicle, camera]; ``objects`` a boolean;
+    ``look`` null, or the ``field`` and a camera relative to its tile: ``translation_m``,
+    ``rotation_wxyz``, and ``intrinsics`` by the names of ``Intrinsics``.
     """
     match json.loads(text):
         case {"select": None, **rest} if not rest:
@@ -347,19 +348,19 @@ def _host(host_and_port: str) -> Address:
 
 
 class Source(Protocol):
-    """Where fields and pictures come from; ``live``: whether more can be asked of it."""
+    """A source of fields and pictures; ``live``: whether it can show more."""
 
     @property
     def live(self) -> LiveSource | None:
-        """Itself, if it shows objects and views from anywhere."""
+        """The source itself, if it shows objects and views from anywhere."""
 
     def run(self) -> Coroutine[Any, Any, None]:
-        """Tell the scene, until cancelled."""
+        """Show things in the scene, until cancelled."""
 
 
 @dataclass(frozen=True)
 class TwinRun:
-    """What ``rfedge twin`` was asked for; ``source`` is made for the scene it is to tell."""
+    """Settings of ``rfedge twin``; ``source`` is made for the scene that it shows things in."""
 
     web: WebSettings
     source: Callable[[TwinScene], Source]
