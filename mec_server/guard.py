@@ -11,7 +11,6 @@ after ``refresh``.
 from __future__ import annotations
 
 import asyncio
-import inspect
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ import structlog
 
 from mec_server.access import AccessFile, Grant
 from mec_server.ledger.peer_log import LogLimiter
-from mec_server.peers import peer_log
+from mec_server.peers import handler_within, peer_log
 from mec_server.proxies import Proxies
 from rfcore.errors import AccessDenied, RfedgeError
 from rfcore.wire.identity import PeerIdentity, peer_identity
@@ -124,29 +123,7 @@ class Guard(grpc.aio.ServerInterceptor):
     ) -> Handler:
         """Wrap the method's handler."""
         handler = await continuation(handler_call_details)
-        if handler is None:
-            return None
-        for kind in ("unary_unary", "unary_stream", "stream_unary", "stream_stream"):
-            behaviour = getattr(handler, kind)
-            if behaviour is not None:
-                return handler._replace(**{kind: self._guarded(behaviour)})
-        return handler
-
-    def _guarded(self, behaviour: Callable[..., Any]) -> Callable[..., Any]:
-        if inspect.isasyncgenfunction(behaviour):
-
-            async def generate(request: Any, context: Any) -> AsyncIterator[Any]:
-                async with self._admitted(context) as seen:
-                    async for response in behaviour(request, seen):
-                        yield response
-
-            return generate
-
-        async def call(request: Any, context: Any) -> Any:
-            async with self._admitted(context) as seen:
-                return await behaviour(request, seen)
-
-        return call
+        return None if handler is None else handler_within(self._admitted, handler)
 
     @asynccontextmanager
     async def _admitted(self, context: Context) -> AsyncIterator[Any]:

@@ -49,7 +49,7 @@ from rfcore.update.run import LearnAs
 from rfcore.views import PosedPicture
 from rfcore.wire.settings import LogForm, configure_logs
 
-__all__ = ["Learner", "Learning", "UnrecordedTrials", "main"]
+__all__ = ["Learner", "UnrecordedTrials", "learning_job", "main"]
 
 log = structlog.get_logger()
 
@@ -61,7 +61,6 @@ STOP_S = 5.0
 MOST_PAUSE_S = 2.0
 """Longest pause between two pictures of one trial; after a longer one another camera is tried."""
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
-Command = tuple[str, ...]
 
 
 class Learner:
@@ -76,7 +75,7 @@ class Learner:
         form: LogForm,
         show: Callable[[Mapping[str, TileHistory]], None],
         now_s: Callable[[], float] = time.monotonic,
-        command: Command = (sys.executable, "-m", "mec_server.learner"),
+        command: Sequence[str] = (sys.executable, "-m", "mec_server.learner"),
     ) -> None:
         self._job, self._show, self._now_s = job, show, now_s
         self._command = (*command, json.dumps(_plain(job)), str(form))
@@ -129,57 +128,24 @@ class Learner:
             process.wait()
 
 
-class Learning:
-    """The learning process of a server, and ``trials`` on vehicles that are not recorded.
-
-    ``open_field`` opens fields for the thread of the trials; ``failed`` is called with what went
-    wrong there; ``show`` is given what was learnt, by tile, with each look.
-    """
-
-    def __init__(
-        self,
-        config: ServerConfig,
-        open_field: Callable[[str], RadianceField],
-        failed: Callable[[Exception], None],
-        show: Callable[[Mapping[str, TileHistory]], None],
-    ) -> None:
-        settings, recordings = config.learn, config.record.folder
-        assert recordings is not None
-        job = LearningJob(
-            config.fields,
-            recordings,
-            settings.learn_as,
-            settings.min_identities,
-            cpu_s_per_h=settings.cpu_s_per_h,
-            max_bytes=round(settings.max_gb * 1e9),
-            max_age_s=settings.max_age_h * 3600,
-            quiet_s=settings.quiet_s,
-            max_field_bytes=config.render.max_field_bytes,
-        )
-        self._show = show
-        self._learner = Learner(job, config.log, self._take_up)
-        self.trials = UnrecordedTrials(open_field, failed, self._learner.report)
-
-    def start(self) -> None:
-        """Start the process."""
-        self._learner.start()
-
-    def look(self) -> None:
-        """Start the process again if it has ended, and show what was learnt; raise ``OSError``."""
-        self._learner.look()
-
-    def close(self) -> None:
-        """End the trials and the process."""
-        self.trials.close()
-        self._learner.close()
-
-    def _take_up(self, histories: Mapping[str, TileHistory]) -> None:
-        self.trials.watch(histories)
-        self._show(histories)
+def learning_job(config: ServerConfig, recordings: Path) -> LearningJob:
+    """Return the job of the learning process of a server that records into ``recordings``."""
+    settings = config.learn
+    return LearningJob(
+        config.fields,
+        recordings,
+        settings.learn_as,
+        settings.min_identities,
+        cpu_s_per_h=settings.cpu_s_per_h,
+        max_bytes=round(settings.max_gb * 1e9),
+        max_age_s=settings.max_age_h * 3600,
+        quiet_s=settings.quiet_s,
+        max_field_bytes=config.render.max_field_bytes,
+    )
 
 
 @dataclass(frozen=True)
-class _Watched:
+class _LearntField:
     """A learnt field that vehicles use now."""
 
     tile: str
@@ -204,7 +170,7 @@ class UnrecordedTrials:
     ) -> None:
         self._open_field, self._report = open_field, report
         self._worker = Workers(1, failed, "trials", begin=work_when_idle)
-        self._watched: Mapping[str, _Watched] = {}
+        self._learnt: Mapping[str, _LearntField] = {}
         self._rested: Counter[tuple[CameraKey, str]] = Counter()
         self._taken: list[ReceivedPicture] = []
         self._is_trying = False
@@ -215,8 +181,8 @@ class UnrecordedTrials:
 
     def watch(self, histories: Mapping[str, TileHistory]) -> None:
         """Try the learnt fields in these histories, unless they were withdrawn."""
-        self._watched = {
-            one.field_id: _Watched(tile, one.replaced_id)
+        self._learnt = {
+            one.field_id: _LearntField(tile, one.replaced_id)
             for tile, history in histories.items()
             for one in history.learnt
             if not one.withdrawn
@@ -224,8 +190,8 @@ class UnrecordedTrials:
 
     def saw(self, view: ReceivedPicture) -> None:
         """Take a picture of a vehicle that is not recorded; called on the event loop."""
-        watched = self._watched.get(view.field_id)
-        if watched is None or view.frame.pose is None:
+        learnt = self._learnt.get(view.field_id)
+        if learnt is None or view.frame.pose is None:
             return
         turn = (view.key, view.field_id)
         self._rested[turn] = max(0, self._rested[turn] - 1)
@@ -241,7 +207,7 @@ class UnrecordedTrials:
             views, self._taken, self._is_trying = self._taken, [], True
             self._rested[turn] = CHECK_EVERY - CHECK_FRAMES
             self._worker.submit(
-                view.vehicle_id, partial(self._tried, watched, views), self._finished
+                view.vehicle_id, partial(self._tried, learnt, views), self._finished
             )
 
     def left(self, vehicle_id: str) -> None:
@@ -256,11 +222,11 @@ class UnrecordedTrials:
             raise outcome
         self._report(outcome)
 
-    def _tried(self, watched: _Watched, views: Sequence[ReceivedPicture]) -> BitsIncrease:
+    def _tried(self, learnt: _LearntField, views: Sequence[ReceivedPicture]) -> BitsIncrease:
         field_id, vehicle_id = views[0].field_id, views[0].vehicle_id
-        before, after = self._open_field(watched.replaced_id), self._open_field(field_id)
+        before, after = self._open_field(learnt.replaced_id), self._open_field(field_id)
         drive = Pass(vehicle_id, tuple(map(_posed, views)))
-        return BitsIncrease(watched.tile, field_id, vehicle_id, percent_worse(before, after, drive))
+        return BitsIncrease(learnt.tile, field_id, vehicle_id, percent_worse(before, after, drive))
 
 
 def _posed(view: ReceivedPicture) -> PosedPicture:

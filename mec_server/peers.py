@@ -12,7 +12,7 @@ import asyncio
 import inspect
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager, suppress
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
@@ -38,7 +38,15 @@ from rfcore.errors import (
 from rfcore.wire.conventions import RETRY_AFTER
 from rfcore.wire.identity import peer_identity
 
-__all__ = ["ChargeRpcs", "Slots", "abort", "peer_account", "peer_log", "status_of"]
+__all__ = [
+    "ChargeRpcs",
+    "Slots",
+    "abort",
+    "handler_within",
+    "peer_account",
+    "peer_log",
+    "status_of",
+]
 
 log = structlog.get_logger()
 
@@ -140,6 +148,33 @@ class Slots:
         self._limited(error.limit)
 
 
+Around = Callable[[Context], AbstractAsyncContextManager[Context]]
+
+
+def handler_within(around: Around, handler: Any) -> Handler:
+    """Return ``handler`` with its one behaviour run within ``around`` (see grpc.RpcMethodHandler).
+
+    The behaviour is given the context that ``around`` yields.
+    """
+    kinds = ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
+    (kind,) = (kind for kind in kinds if getattr(handler, kind) is not None)
+    behaviour = getattr(handler, kind)
+
+    async def call(request: Any, context: Context) -> Any:
+        async with around(context) as seen:
+            return await behaviour(request, seen)
+
+    async def generate(request: Any, context: Context) -> AsyncIterator[Any]:
+        async with around(context) as seen:
+            async for response in behaviour(request, seen):
+                yield response
+
+    make = getattr(grpc, f"{kind}_rpc_method_handler")
+    wrapped = generate if inspect.isasyncgenfunction(behaviour) else call
+    made = make(wrapped, handler.request_deserializer, handler.response_serializer)
+    return cast("Handler", made)
+
+
 async def _unknown_method(requests: AsyncIterator[bytes], context: Context) -> None:  # noqa: ARG001
     await context.abort(grpc.StatusCode.UNIMPLEMENTED, "this server has no such method")
 
@@ -182,9 +217,9 @@ class ChargeRpcs(grpc.aio.ServerInterceptor):
         header_bytes = sum(len(name) + len(value) for name, value in headers)
         if header_bytes > MOST_HEADER_BYTES:
             refusal = partial(self._too_large, header_bytes)
-            return self._charged(grpc.stream_stream_rpc_method_handler(refusal))
+            return handler_within(self._held, grpc.stream_stream_rpc_method_handler(refusal))
         handler = await continuation(handler_call_details)
-        return self._charged(UNKNOWN_METHOD if handler is None else handler)
+        return handler_within(self._held, UNKNOWN_METHOD if handler is None else handler)
 
     async def _too_large(
         self, header_bytes: int, requests: AsyncIterator[bytes], context: Context
@@ -197,33 +232,12 @@ class ChargeRpcs(grpc.aio.ServerInterceptor):
             await abort(context, LimitExceeded(Limit.HEADER_BYTES, limit))
         raise asyncio.CancelledError
 
-    def _charged(self, handler: Any) -> Handler:
-        """Return ``handler`` with its one behaviour wrapped (see grpc.RpcMethodHandler)."""
-        kinds = ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
-        (name,) = (kind for kind in kinds if getattr(handler, kind) is not None)
-        make = getattr(grpc, f"{name}_rpc_method_handler")
-        behaviour = self._wrapped(getattr(handler, name))
-        made = make(behaviour, handler.request_deserializer, handler.response_serializer)
-        return cast("Handler", made)
-
-    def _wrapped(self, behaviour: Callable[..., Any]) -> Callable[..., Any]:
-        async def call(request: Any, context: Context) -> Any:
-            async with self._held(context):
-                return await behaviour(request, context)
-
-        async def generate(request: Any, context: Context) -> AsyncIterator[Any]:
-            async with self._held(context):
-                async for response in behaviour(request, context):
-                    yield response
-
-        return generate if inspect.isasyncgenfunction(behaviour) else call
-
     @asynccontextmanager
-    async def _held(self, context: Context) -> AsyncIterator[None]:
+    async def _held(self, context: Context) -> AsyncIterator[Context]:
         """Hold what the call takes while it lasts; an unexpected failure ends it with INTERNAL."""
         with await self._hold(context):
             try:
-                yield
+                yield context
             except grpc.aio.AbortError:
                 raise
             except Exception:

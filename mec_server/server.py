@@ -36,7 +36,7 @@ from mec_server.fields.index import FieldIndex, PublishedFields, field_loader
 from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf
 from mec_server.guard import Guard
-from mec_server.learner import Learning
+from mec_server.learner import Learner, UnrecordedTrials, learning_job
 from mec_server.ledger.budgets import (
     Resource,
     budgets_of,
@@ -186,10 +186,15 @@ class EdgeServer:
         )
         self._recorder = open_recorder(config.record, tiles, self._recording_failed)
         self._metrics.recording.set(self._recorder is not None)
-        self._learning: Learning | None = None
-        if config.learn.on:
+        self._learner: Learner | None = None
+        self._trials: UnrecordedTrials | None = None
+        if config.learn.on and config.record.folder is not None:
+            job = learning_job(config, config.record.folder)
+            self._learner = Learner(job, config.log, self._show_learnt)
             failed = self._failed(BackgroundTask.LEARNING)
-            self._learning = Learning(config, self._fields_of_a_thread(), failed, self._show_learnt)
+            self._trials = UnrecordedTrials(
+                self._fields_of_a_thread(), failed, self._learner.report
+            )
 
     def _make_services(self, open_decoders: OpenCameras, classify: Classify | None) -> None:
         """Make the services, and the gRPC server that they belong to."""
@@ -265,7 +270,7 @@ class EdgeServer:
             log_limiter=self._log_limiter,
             connections=self._connections,
             twin=self._twin,
-            trials=None if self._learning is None else self._learning.trials,
+            trials=self._trials,
         )
 
     @contextmanager
@@ -319,9 +324,9 @@ class EdgeServer:
         self._connections.listen(self.address.port)
         self._follow(self.take_up_fields, PUBLICATIONS_EVERY_S, BackgroundTask.PUBLICATIONS)
         self._follow(self._sweep_calls, SWEEP_EVERY_S, BackgroundTask.ACCESS)
-        if self._learning is not None:
-            self._learning.start()
-            look = partial(asyncio.to_thread, self._learning.look)
+        if self._learner is not None:
+            self._learner.start()
+            look = partial(asyncio.to_thread, self._learner.look)
             self._follow(look, LEARNING_EVERY_S, BackgroundTask.LEARNING)
         self._follow(self.index_fields, FIELDS_EVERY_S, BackgroundTask.FIELDS)
         if self._config.notices:
@@ -374,7 +379,14 @@ class EdgeServer:
         await asyncio.to_thread(self._lister.shutdown)
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
-        for part in (self._views, self._learning, self._recorder, self._metrics_endpoint):
+        parts = (
+            self._views,
+            self._trials,
+            self._learner,
+            self._recorder,
+            self._metrics_endpoint,
+        )
+        for part in parts:
             if part is not None:
                 await asyncio.to_thread(part.close)
 
@@ -462,6 +474,8 @@ class EdgeServer:
 
     def _show_learnt(self, histories: Mapping[str, TileHistory]) -> None:
         self._metrics.show_learnt(histories)
+        if self._trials is not None:
+            self._trials.watch(histories)
         self._field_service.show_learnt(
             one for name, history in histories.items() for one in history.newest(name)
         )

@@ -12,6 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -19,10 +20,11 @@ from weakref import WeakKeyDictionary
 import grpc
 
 from mec_server.config import SessionLimits
+from mec_server.ledger.ledger import Hold
 from mec_server.peers import Slots, abort, peer_account
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
 from mec_server.twin.rendering import ViewedTile, ViewService
-from mec_server.twin.state import Covers, Mailbox, ReceivedPicture, Twin
+from mec_server.twin.state import Covers, Entry, Mailbox, ReceivedPicture, Twin
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
 from rfcore.perception.objects import ObjectReports, StreetObject
 from rfcore.wire.twin import (
@@ -98,13 +100,112 @@ class ConsumerAccess:
     may_draw: Callable[[str], bool]
 
 
+class ConsumerStream:
+    """Writes to one consumer until it leaves, reads too slowly, or the server drains.
+
+    ``end``: why the stream ends. ``unread``: a message that the consumer does not take.
+    """
+
+    def __init__(self, stalled_s: float, drained: asyncio.Task[bool]) -> None:
+        self.end = ConsumerEnd.LEFT
+        self.unread: asyncio.Task[None] | None = None
+        self._stalled_s = stalled_s
+        self._drained = drained
+
+    @property
+    def is_draining(self) -> bool:
+        """Whether the server drains, which ends the stream."""
+        if self._drained.done():
+            self.end = ConsumerEnd.DRAINED
+        return self._drained.done()
+
+    async def write(self, work: Coroutine[None, None, None]) -> bool:
+        """Do ``work``, which writes a message; return whether the stream goes on."""
+        writing = asyncio.create_task(work)
+        await asyncio.wait(
+            {writing, self._drained},
+            timeout=self._stalled_s,
+            return_when=asyncio.FIRST_COMPLETED,
+        )
+        if writing.done():
+            writing.result()
+        elif self.is_draining:
+            writing.cancel()
+        else:
+            self.unread, self.end = writing, ConsumerEnd.SLOW
+        return writing.done() and not self.is_draining
+
+    async def wait(self, arrived: asyncio.Event, within_s: float | None) -> bool:
+        """Wait for ``arrived`` or the draining; return whether either came ``within_s``."""
+        arriving = asyncio.create_task(arrived.wait())
+        done, _ = await asyncio.wait(
+            {arriving, self._drained}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED
+        )
+        arriving.cancel()
+        arrived.clear()
+        return bool(done)
+
+
+class ConsumerStreams:
+    """Admits consumers, counts them, and ends their streams.
+
+    ``slots`` limits their number; one that took nothing for ``stalled_s`` is disconnected.
+    ``failed`` is called with an unexpected exception, which ends its stream.
+    """
+
+    def __init__(
+        self,
+        metrics: TwinMetrics,
+        slots: Slots,
+        stalled_s: float,
+        failed: Callable[[Exception], None],
+    ) -> None:
+        self.draining = asyncio.Event()
+        self.failed = failed
+        self._metrics = metrics
+        self._slots = slots
+        self._stalled_s = stalled_s
+
+    async def hold(self, context: AnyContext) -> Hold:
+        """Return the slot of a call, to be released when it is over; abort a call too many."""
+        try:
+            return self._slots.hold(context)
+        except LimitExceeded as error:
+            self._metrics.ended.labels(ConsumerEnd.REFUSED).inc()
+            await abort(context, error)
+
+    @asynccontextmanager
+    async def opened(self, context: AnyContext) -> AsyncIterator[ConsumerStream]:
+        """Count a consumer while the block lasts; abort the call of one that was too slow."""
+        drained = asyncio.create_task(self.draining.wait())
+        stream = ConsumerStream(self._stalled_s, drained)
+        self._metrics.consumers.inc()
+        try:
+            yield stream
+        except grpc.aio.AbortError:
+            raise
+        except Exception as error:
+            self.failed(error)
+            raise
+        finally:
+            drained.cancel()
+            self._metrics.consumers.dec()
+            self._metrics.ended.labels(stream.end).inc()
+            self._slots.log(context).info("consumer ended", reason=str(stream.end))
+        if stream.unread is not None:
+            await stream.unread  # gRPC sends no status before what is being written
+            await context.abort(
+                grpc.StatusCode.RESOURCE_EXHAUSTED,
+                f"nothing was taken for {self._stalled_s:g} s; read faster",
+            )
+
+
 class TwinService(twin_pb2_grpc.TwinServiceServicer):
     """Streams the pictures of ``twin`` to consumers, and views that ``views`` composes.
 
-    ``slots`` limits the number of consumers. One that took nothing for ``limits.stalled_s`` is
-    disconnected, as is one that asks for views and asked for none in ``limits.idle_s``. ``failed``
-    is called with an unexpected exception, which ends its stream. ``access`` returns what the peer
-    of a call may see.
+    For ``slots``, ``failed`` and ``limits.stalled_s`` see ``ConsumerStreams``. A consumer that
+    moves a view and asked for none in ``limits.idle_s`` is disconnected. ``access`` returns what
+    the peer of a call may see.
     """
 
     def __init__(
@@ -120,13 +221,10 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         self._twin = twin
         self._access = access
         self._metrics = metrics
-        self._slots = slots
-        self._stalled_s = limits.stalled_s
-        self._failed = failed
-        self._pictures = PictureEncoder()
-        self._draining = asyncio.Event()
         self._views = views
-        self._renders = RenderCalls(views, metrics, slots, limits, failed, access, self._draining)
+        self._pictures = PictureEncoder()
+        self._streams = ConsumerStreams(metrics, slots, limits.stalled_s, failed)
+        self._renders = RenderCalls(views, self._streams, limits.idle_s, access)
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
@@ -139,7 +237,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
 
     def drain(self) -> None:
         """End the stream of every consumer."""
-        self._draining.set()
+        self._streams.draining.set()
 
     def close(self) -> None:
         """Stop encoding."""
@@ -167,14 +265,10 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
             access.check_vehicles(subscription.vehicle_ids)
         except (InvalidInput, AccessDenied) as error:
             await abort(context, error)
-        try:
-            held = self._slots.hold(context)
-        except LimitExceeded as error:
-            self._metrics.ended.labels(ConsumerEnd.REFUSED).inc()
-            await abort(context, error)
-        consumer = _PictureWriter(self._twin, self._pictures, self._metrics, context)
-        with held:
-            await self._watch(subscription, access.covers, context, consumer)
+        writer = _PictureWriter(self._twin, self._pictures, self._metrics, context)
+        with await self._streams.hold(context):
+            async with self._streams.opened(context) as stream:
+                await writer.serve(stream, subscription, access.covers)
 
     async def Objects(  # type: ignore[override]  # noqa: N802
         self, request: pb.ObjectsRequest, context: AnyContext
@@ -183,87 +277,41 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         try:
             access = self._access(context)
             tile = self._views.tile(objects_request_from_wire(request), access.may_draw)
-            held = self._slots.hold(context)
         except RfedgeError as error:
             await abort(context, error)
 
         def covers(vehicle_id: str, field_id: str) -> bool:
             return field_id in tile.field_ids and access.covers(vehicle_id, field_id)
 
-        consumer = _ObjectsWriter(self._twin, self._views, self._metrics, context, tile)
-        with held:
-            await self._watch(Subscription(), covers, context, consumer)
-
-    async def _watch(
-        self,
-        subscription: Subscription,
-        covers: Covers,
-        context: AnyContext,
-        consumer: _MailboxWriter,
-    ) -> None:
-        self._metrics.consumers.inc()
-        end = ConsumerEnd.LEFT
-        try:
-            end = await consumer.serve(subscription, covers, self._stalled_s, self._draining)
-        except Exception as error:
-            self._failed(error)
-            raise
-        finally:
-            self._metrics.consumers.dec()
-            self._metrics.ended.labels(end).inc()
-            self._slots.log(context).info("consumer ended", reason=str(end))
-        if consumer.unread is not None:
-            await consumer.unread  # gRPC sends no status before what is being written
-            await context.abort(
-                grpc.StatusCode.RESOURCE_EXHAUSTED,
-                f"nothing was taken for {self._stalled_s:g} s; read faster",
-            )
+        writer = _ObjectsWriter(self._twin, self._views, self._metrics, context, tile)
+        with await self._streams.hold(context):
+            async with self._streams.opened(context) as stream:
+                await writer.serve(stream, Subscription(), covers)
 
 
 class _MailboxWriter(ABC):
-    """Writes the entries of one mailbox; ``unread``: what a slow consumer did not take."""
+    """Writes the entries of one mailbox."""
 
     def __init__(self, twin: Twin, context: AnyContext) -> None:
         self._twin = twin
         self._context = context
         self._arrived = asyncio.Event()
-        self.unread: asyncio.Task[None] | None = None
 
     async def serve(
-        self,
-        subscription: Subscription,
-        covers: Covers,
-        stalled_s: float,
-        draining: asyncio.Event,
-    ) -> ConsumerEnd:
-        """Write entries until the stream is over; return the reason."""
+        self, stream: ConsumerStream, subscription: Subscription, covers: Covers
+    ) -> None:
+        """Write entries until the stream is over."""
         mailbox = self._twin.watch(subscription, self._arrived.set, covers)
-        drained = asyncio.create_task(draining.wait())
         try:
-            await self._context.send_initial_metadata(
-                ()
-            )  # from here on every missed picture is counted
-            while not draining.is_set():
+            # From here on every missed picture is counted.
+            await self._context.send_initial_metadata(())
+            while not stream.is_draining:
                 work = self._next(mailbox)
                 if work is None:
-                    await self._rest(drained)
-                    continue
-                writing = asyncio.create_task(work)
-                await asyncio.wait(
-                    {writing, drained},
-                    timeout=stalled_s,
-                    return_when=asyncio.FIRST_COMPLETED,
-                )
-                if not writing.done() and draining.is_set():
-                    writing.cancel()
-                    return ConsumerEnd.DRAINED
-                if not writing.done():
-                    self.unread = writing
-                    return ConsumerEnd.SLOW
-                writing.result()
-            return ConsumerEnd.DRAINED
+                    await stream.wait(self._arrived, self._rest_s())
+                elif not await stream.write(work):
+                    return
         finally:
-            drained.cancel()
             self._twin.unwatch(mailbox)
 
     def _next(self, mailbox: Mailbox) -> Coroutine[None, None, None] | None:
@@ -275,16 +323,8 @@ class _MailboxWriter(ABC):
         """Return how long to wait for an entry; None for no limit."""
         return None
 
-    async def _rest(self, drained: asyncio.Task[bool]) -> None:
-        arrived = asyncio.create_task(self._arrived.wait())
-        await asyncio.wait(
-            {arrived, drained}, timeout=self._rest_s(), return_when=asyncio.FIRST_COMPLETED
-        )
-        arrived.cancel()
-        self._arrived.clear()
-
     @abstractmethod
-    async def _write(self, mailbox: Mailbox, entry: ReceivedPicture | Departure) -> None:
+    async def _write(self, mailbox: Mailbox, entry: Entry) -> None:
         """Write the message for one entry."""
 
 
@@ -298,7 +338,7 @@ class _PictureWriter(_MailboxWriter):
         self._pictures = pictures
         self._metrics = metrics
 
-    async def _write(self, mailbox: Mailbox, entry: ReceivedPicture | Departure) -> None:
+    async def _write(self, mailbox: Mailbox, entry: Entry) -> None:
         if isinstance(entry, Departure):
             await self._context.write(twin_message_to_wire(entry))
             return
@@ -342,7 +382,7 @@ class _ObjectsWriter(_MailboxWriter):
         again_s = self._reports.again_s
         return max(0.0, again_s - time.monotonic()) if math.isfinite(again_s) else None
 
-    async def _write(self, mailbox: Mailbox, entry: ReceivedPicture | Departure) -> None:
+    async def _write(self, mailbox: Mailbox, entry: Entry) -> None:
         if isinstance(entry, ReceivedPicture):
             try:
                 found = await self._views.objects_in(entry, self._tile, self._identity)
@@ -394,124 +434,81 @@ def picture_message(
 
 
 class RenderCalls:
-    """Answers the calls of ``TwinService``, whose arguments it takes, for views.
-
-    Each call holds one of ``slots`` for as long as it lasts.
-    """
+    """Answers calls of ``TwinService`` for views; each holds a slot for as long as it lasts."""
 
     def __init__(
         self,
         views: ViewService,
-        metrics: TwinMetrics,
-        slots: Slots,
-        limits: SessionLimits,
-        failed: Callable[[Exception], None],
+        streams: ConsumerStreams,
+        idle_s: float,
         access: Callable[[AnyContext], ConsumerAccess],
-        draining: asyncio.Event,
     ) -> None:
         self._views = views
-        self._metrics = metrics
-        self._slots = slots
-        self._stalled_s, self._idle_s = limits.stalled_s, limits.idle_s
-        self._failed = failed
+        self._streams = streams
+        self._idle_s = idle_s
         self._access = access
-        self._draining = draining
 
     async def render(self, request: pb.RenderRequest, context: AnyContext) -> pb.RenderResponse:
         """Return one view, or end the call with the status of the error."""
-        with await self._hold(context):
-            return rendered_view_to_wire(await self._view(request, context))
+        with await self._streams.hold(context):
+            try:
+                return rendered_view_to_wire(await self._view(request, context))
+            except RfedgeError as error:
+                await abort(context, error)
+            except Exception as error:
+                self._streams.failed(error)
+                raise
 
     async def render_stream(
         self, requests: AsyncIterator[pb.RenderStreamRequest], context: AnyContext
     ) -> None:
         """Answer requests until the peer has no more, asks for nothing for long, reads too slowly,
         or the server drains."""
-        with await self._hold(context):
-            self._metrics.consumers.inc()
-            end = ConsumerEnd.LEFT
-            identity, _ = peer_account(context)
-            moving = _ViewRequests(requests, lambda: self._views.spend_message(identity))
-            drained = asyncio.create_task(self._draining.wait())
-            try:
-                end = await self._follow(moving, drained, context)
-            finally:
-                drained.cancel()
-                moving.close()
-                self._metrics.consumers.dec()
-                self._metrics.ended.labels(end).inc()
-                self._slots.log(context).info("consumer ended", reason=str(end))
-        if moving.unread is not None:
-            await moving.unread  # gRPC sends no status before what is being written
-            await context.abort(
-                grpc.StatusCode.RESOURCE_EXHAUSTED,
-                f"nothing was taken for {self._stalled_s:g} s; read faster",
-            )
-        if end is ConsumerEnd.IDLE:
-            await context.abort(
-                grpc.StatusCode.DEADLINE_EXCEEDED,
-                f"no view was asked for within {self._idle_s:g} s; open another stream when one is",
-            )
-
-    async def _hold(self, context: AnyContext) -> Any:
-        try:
-            return self._slots.hold(context)
-        except RfedgeError as error:
-            self._metrics.ended.labels(ConsumerEnd.REFUSED).inc()
-            await abort(context, error)
+        identity, _ = peer_account(context)
+        with await self._streams.hold(context):
+            async with self._streams.opened(context) as stream:
+                asked = _ViewRequests(requests, lambda: self._views.spend_message(identity))
+                try:
+                    await self._follow(asked, stream, context)
+                except RfedgeError as error:
+                    await abort(context, error)
+                finally:
+                    asked.close()
+            if stream.end is ConsumerEnd.IDLE:
+                await context.abort(
+                    grpc.StatusCode.DEADLINE_EXCEEDED,
+                    f"no view was asked for within {self._idle_s:g} s; "
+                    "open another stream when one is",
+                )
 
     async def _view(self, request: pb.RenderRequest, context: AnyContext) -> RenderedView:
-        try:
-            access = self._access(context)
-            asked = view_request_from_wire(request)
-            identity, _ = peer_account(context)
-            return await self._views.view(asked, identity, access.covers, access.may_draw)
-        except RfedgeError as error:
-            await abort(context, error)
-        except Exception as error:
-            self._failed(error)
-            raise
+        access, (identity, _) = self._access(context), peer_account(context)
+        asked = view_request_from_wire(request)
+        return await self._views.view(asked, identity, access.covers, access.may_draw)
 
     async def _follow(
-        self, moving: _ViewRequests, drained: asyncio.Task[bool], context: AnyContext
-    ) -> ConsumerEnd:
-        while (request := await moving.next(drained, self._idle_s)) is not None:
-            skipped = moving.skipped
+        self, asked: _ViewRequests, stream: ConsumerStream, context: AnyContext
+    ) -> None:
+        while (request := await asked.next(stream, self._idle_s)) is not None:
+            skipped = asked.skipped
             view = replace(await self._view(request, context), skipped=skipped)
             answer = pb.RenderStreamResponse(view=rendered_view_to_wire(view))
-            writing = asyncio.create_task(context.write(answer))
-            await asyncio.wait(
-                {writing, drained}, timeout=self._stalled_s, return_when=asyncio.FIRST_COMPLETED
-            )
-            if not writing.done() and drained.done():
-                writing.cancel()
-                return ConsumerEnd.DRAINED
-            if not writing.done():
-                moving.unread = writing
-                return ConsumerEnd.SLOW
-            writing.result()
-        if moving.error is not None:
-            await abort(context, moving.error)
-        if moving.is_idle:
-            return ConsumerEnd.IDLE
-        return ConsumerEnd.DRAINED if drained.done() else ConsumerEnd.LEFT
+            if not await stream.write(context.write(answer)):
+                return
 
 
 class _ViewRequests:
     """Reads the requests of one stream and keeps the newest.
 
-    ``spend`` is called for each and may raise ``LimitExceeded``, which ends the reading. ``error``:
-    the error that ended it, if there was one. ``is_idle``: no request came for too long.
-    ``skipped``: requests without an answer. ``unread``: an answer that the peer does not take.
+    ``spend`` is called for each and may raise ``LimitExceeded``, which ends the reading.
+    ``skipped``: requests without an answer.
     """
 
     def __init__(
         self, requests: AsyncIterator[pb.RenderStreamRequest], spend: Callable[[], None]
     ) -> None:
         self.skipped = 0
-        self.is_idle = False
-        self.error: RfedgeError | None = None
-        self.unread: asyncio.Task[None] | None = None
+        self._error: RfedgeError | None = None
         self._newest: pb.RenderRequest | None = None
         self._spend = spend
         self._arrived = asyncio.Event()
@@ -522,23 +519,19 @@ class _ViewRequests:
         """Read no more."""
         self._reading.cancel()
 
-    async def next(self, drained: asyncio.Task[bool], within_s: float) -> pb.RenderRequest | None:
+    async def next(self, stream: ConsumerStream, within_s: float) -> pb.RenderRequest | None:
         """Wait for a request and return the newest.
 
-        Return None when there will be none, or none came ``within_s``.
+        Return None when there will be none, or none came ``within_s``; raise ``LimitExceeded``.
         """
-        while self._newest is None and not self._reading.done() and not drained.done():
-            arrived = asyncio.create_task(self._arrived.wait())
-            done, _ = await asyncio.wait(
-                {arrived, drained}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED
-            )
-            arrived.cancel()
-            self._arrived.clear()
-            if not done:
-                self.is_idle = True
-                break
-        if drained.done() or self.is_idle or self.error is not None:
+        while self._newest is None and not self._reading.done() and not stream.is_draining:
+            if not await stream.wait(self._arrived, within_s):
+                stream.end = ConsumerEnd.IDLE
+                return None
+        if stream.is_draining:
             return None
+        if self._error is not None:
+            raise self._error
         request, self._newest = self._newest, None
         return request
 
@@ -547,7 +540,7 @@ class _ViewRequests:
             try:
                 self._spend()
             except RfedgeError as error:
-                self.error = error
+                self._error = error
                 return
             self.skipped += self._newest is not None
             self._newest = request.view

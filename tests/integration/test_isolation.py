@@ -413,7 +413,7 @@ async def recording_fails(scene: Scene) -> Any:
 
 async def learning_fails(scene: Scene) -> Any:
     scene.patch.setattr("mec_server.server.LEARNING_EVERY_S", 0.001)
-    scene.patch.setattr("mec_server.server.Learning.look", surprise)
+    scene.patch.setattr("mec_server.server.Learner.look", surprise)
     learn = LearnSettings(on=True)
     async with scene.serve(record=scene.folder, learn=learn) as server:
         await until(lambda: failed(server, BackgroundTask.LEARNING))
