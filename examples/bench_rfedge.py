@@ -1,4 +1,4 @@
-"""Our own coder handed in to the benchmark, by the door that is everybody's; and its decoder.
+"""Our own coder as a submission to the benchmark, and its decoder.
 
 rfedge-lab benchmark run out/rfedge --name rfedge --points 17 20 23 26 29 32 35 38 41 \
     --prior samples/fields/street.rff \

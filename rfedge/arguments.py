@@ -1,14 +1,14 @@
-"""What commands take on the command line: placeholders, fields by path or name, sizes, durations.
+"""Arguments that several commands share: placeholders, fields by path or name, sizes, durations.
 
-The placeholders stand in a verb's help where a type's name (PATH, STR) would say nothing::
+A placeholder replaces the name of a type (PATH, STR) in a verb's help::
 
     field: Annotated[Path, Positional, FIELD]
 
-``field_path`` is the one resolver of every command that takes a field. A name is what the field was
-imported under (``out/fields/NAME.rff``) or a sample's (``samples/fields/NAME.rff``), in this order;
-a file of that path comes before both.
+Every command that takes a field resolves it by ``field_path``: as a path, or as the name of an
+imported field (``out/fields/NAME.rff``) or of a sample's field (``samples/fields/NAME.rff``), in
+this order.
 
-This module is imported for every ``--help`` and therefore imports nothing heavy itself.
+Every ``--help`` imports this module, which therefore imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ __all__ = [
     "RENDERER",
     "RFF",
     "SAMPLES",
-    "SCENE",
     "SIZE",
     "SPLATS",
     "check_folder",
@@ -55,10 +54,9 @@ __all__ = [
 ]
 
 FIELD = arg(metavar="FIELD")
-"""An archive's path, or a field's name."""
+"""The path of an archive, or the name of a field."""
 DATASET = arg(metavar="DATASET")
 """A dataset's folder, or the file that describes it (docs/how-to/data.md)."""
-SCENE = arg(metavar="SCENE")
 ADDRESS = arg(metavar="HOST:PORT")
 SIZE = arg(metavar="WIDTHxHEIGHT")
 FOLDER = arg(metavar="FOLDER")
@@ -69,7 +67,7 @@ SPLATS = arg(metavar="FILE.ply|.spz")
 JSON = arg(metavar="FILE.json")
 
 IMPORTED = Path("out/fields")
-"""Where ``rfedge field import`` puts what it reads."""
+"""Folder of the fields that ``rfedge field import`` writes."""
 SAMPLES = sample_path("fields")
 SUFFIX = ".rff"
 PICTURES = (".gif", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -77,7 +75,7 @@ VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
 
 def field_path(name: Path | str) -> Path:
-    """Return the file of a field; raise ``InvalidInput`` listing what was tried and what exists."""
+    """Return the file of a field; raise ``InvalidInput`` with the tried and the known names."""
     tried = list(_candidates(Path(name)))
     found = next((path for path in tried if path.is_file()), None)
     if found is not None:
@@ -91,7 +89,7 @@ def field_path(name: Path | str) -> Path:
 
 
 def is_field_file(path: Path) -> bool:
-    """Return whether a file is a field's archive, by how it begins."""
+    """Return whether a file begins as a field's archive."""
     from rfcore.field.archive import MAGIC
 
     if not path.is_file():
@@ -111,7 +109,7 @@ def open_field(name: Path | str, *, threads: int = 1, isa: str | None = None) ->
 
 
 def max_field_bytes() -> int:
-    """Return the memory that a field's splats may take, which RFEDGE_MAX_FIELD_GB states.
+    """Return the memory that a field's splats may take, from RFEDGE_MAX_FIELD_GB.
 
     Raises ``InvalidInput`` if that is not a number from 0.001 to 1000.
     """
@@ -128,7 +126,7 @@ def max_field_bytes() -> int:
 
 
 def open_splats(name: Path | str, *, threads: int) -> SplatField:
-    """Load a field that must be made of splats; raise ``InvalidInput`` for another kind."""
+    """Load a field of splats; raise ``InvalidInput`` for another kind."""
     from rfcore.field import SplatField
 
     field = open_field(name, threads=threads)
@@ -145,7 +143,7 @@ def _candidates(name: Path) -> Iterator[Path]:
 
 
 def check_folder(path: Path, wanted: str) -> None:
-    """Raise ``InvalidInput`` for a folder to write that is named as a picture or a video.
+    """Raise ``InvalidInput`` for an output folder that is named like a picture or a video.
 
     ``wanted`` says what to name instead.
     """
@@ -182,7 +180,7 @@ def nats_servers(
     *,
     allow_insecure: bool,
 ) -> NatsServers:
-    """Return how NATS is reached, of the options of a consumer; raise ``InvalidInput``."""
+    """Return the NATS servers that a consumer's options name; raise ``InvalidInput``."""
     from rfcore.wire.nats import NatsServers
 
     parsed = NatsServers.parse_urls(urls)

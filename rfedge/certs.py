@@ -42,12 +42,12 @@ __all__ = [
 
 MAX_DAYS = 3650
 BACKDATED = timedelta(hours=1)
-"""A vehicle whose clock is a little slow shall not find its new certificate in the future."""
+"""New certificates are valid from a little earlier, for clients whose clocks are slow."""
 
 
 @dataclass(frozen=True)
 class Members:
-    """Whom the authority vouches for; ``hosts`` are names or addresses of the server."""
+    """The names that get certificates; ``hosts`` are names or addresses of the server."""
 
     vehicles: tuple[str, ...]
     consumers: tuple[str, ...] = ()
@@ -57,7 +57,7 @@ class Members:
 
     @property
     def clients(self) -> tuple[tuple[Role, tuple[str, ...]], ...]:
-        """Everyone but the server, by role."""
+        """The names of all clients, by role."""
         return (
             (Role.VEHICLE, self.vehicles),
             (Role.CONSUMER, self.consumers),
@@ -80,7 +80,7 @@ class Members:
 
 @dataclass(frozen=True)
 class Issued:
-    """One certificate as PEM; ``name`` is its file's, ``identity`` what it says."""
+    """One certificate as PEM, the name of its file, and the identity in it."""
 
     name: str
     identity: str
@@ -97,7 +97,7 @@ class _Authority:
 
 
 def certify(members: Members, now: datetime, days: int) -> tuple[Issued, ...]:
-    """Make an authority and sign a certificate for everyone, good for ``days`` from ``now``."""
+    """Make an authority and sign a certificate for every member, valid ``days`` from ``now``."""
     _check_days(days)
     authority = _authority(now, days)
     server = [x509.UniformResourceIdentifier(identity_uri(Role.SERVER, "edge"))]
@@ -118,11 +118,11 @@ def _clients(authority: _Authority, members: Members) -> Iterator[Issued]:
 def add_certificates(
     folder: Path, members: Members, now: datetime, days: int
 ) -> tuple[Issued, ...]:
-    """Sign certificates for further clients with the authority of ``folder``, and write them into
-    it; those that are there stay as they are.
+    """Sign certificates for further clients with the authority in ``folder``, and write them there.
 
-    Raises ``InvalidInput`` for a name that has a certificate already, or a folder without the
-    authority's key; ``InvalidData`` for a key that is not the authority's.
+    Existing certificates stay as they are. Raises ``InvalidInput`` for a name that has a
+    certificate already, or a folder without the authority's key; ``InvalidData`` for a key that is
+    not the authority's.
     """
     _check_days(days)
     issued = tuple(_clients(_read_authority(folder, now, days), members))
@@ -206,7 +206,7 @@ def _signed(authority: _Authority, name: str, names: list[x509.GeneralName]) -> 
 def _builder(
     subject: x509.Name, key: ec.EllipticCurvePrivateKey, now: datetime, days: int
 ) -> x509.CertificateBuilder:
-    """Return what every certificate has in common."""
+    """Return a builder with the fields that all certificates have in common."""
     own = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
     return (
         x509.CertificateBuilder()
@@ -242,10 +242,10 @@ def _host_name(host: str) -> x509.GeneralName:
 
 
 def write_certificates(folder: Path, issued: Sequence[Issued], *, replace: bool = False) -> None:
-    """Write ``NAME.pem`` and ``NAME.key`` (mode 0600) of each into a new folder.
+    """Write ``NAME.pem`` and ``NAME.key`` (mode 0600) of each certificate into a new folder.
 
-    ``replace``: a folder that holds nothing but certificates makes way, at the end. Raises
-    ``InvalidInput`` when the folder is there and may not be replaced, ``OSError``.
+    With ``replace``, a folder that holds nothing but certificates is replaced at the end. Raises
+    ``InvalidInput`` if the folder exists and may not be replaced, and ``OSError``.
     """
     if not replace and folder.exists():
         raise InvalidInput("out", f"{folder} exists; --replace makes all its certificates anew")
@@ -257,7 +257,7 @@ def write_certificates(folder: Path, issued: Sequence[Issued], *, replace: bool 
         for one in issued:
             (partial / f"{one.name}.pem").write_bytes(one.certificate)
             _write_key(partial / f"{one.name}.key", one.key)
-        partial.chmod(0o755)  # the keys guard themselves, and services of other users read ca.pem
+        partial.chmod(0o755)  # services of other users read ca.pem; keys have their own mode
     if folder.exists():
         folder.rename(old)
     new.rename(folder)
@@ -273,7 +273,7 @@ def _check_replaceable(folder: Path) -> None:
 
 
 def _write_key(path: Path, key: bytes) -> None:
-    """Write a file that nobody else could ever have read."""
+    """Write a file that only its owner can read, from the moment it exists."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with open(descriptor, "wb") as file:  # noqa: PTH123 (a descriptor, not a path)
         file.write(key)
@@ -281,14 +281,14 @@ def _write_key(path: Path, key: bytes) -> None:
 
 @dataclass(frozen=True)
 class CertificateInfo:
-    """Until when a certificate is good, and its subject alternative names (an authority's none)."""
+    """The end of a certificate's validity, and its subject alternative names."""
 
     until: datetime
     names: tuple[str, ...]
 
 
 def read_certificates(folder: Path) -> dict[str, CertificateInfo]:
-    """Read every ``*.pem`` in ``folder``, by name. Raises ``InvalidInput``, ``InvalidData``."""
+    """Read every ``*.pem`` in ``folder``, by name; raise ``InvalidInput`` or ``InvalidData``."""
     paths = sorted(folder.glob("*.pem"))
     if not paths:
         raise InvalidInput("folder", f"{folder} holds no certificates")

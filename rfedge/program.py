@@ -1,4 +1,4 @@
-"""What every command-line program of the project does: parse, run one verb, report errors.
+"""Run a command-line program of the project: parse, run one verb, report errors.
 
 A verb is one frozen dataclass, its options (their docstrings are the ``--help``), with a ``run``
 method. Heavy imports happen inside ``run``, so that ``--help`` is immediate.
@@ -39,19 +39,19 @@ flags have one form, and help shows neither None nor PATH where a word says more
 
 
 SIGPIPE_STATUS = 141
-"""What shells report for a program that was ended by SIGPIPE."""
+"""Exit status that shells report for a program that SIGPIPE ended."""
 
 
 class Verb(Protocol):
     """One command with its options."""
 
     def run(self) -> None:
-        """Do what was asked for."""
+        """Run the command."""
 
 
 def run_program(name: str, parse: Callable[[], Verb]) -> int:
     """Parse the command line with ``parse``, run the verb, and return the exit status."""
-    if isinstance(sys.stdout, io.TextIOWrapper):  # a log file gets cost and progress as they come
+    if isinstance(sys.stdout, io.TextIOWrapper):  # so that a log file gets each line at once
         sys.stdout.reconfigure(line_buffering=True)
     try:
         return _run(name, parse)
@@ -64,7 +64,7 @@ def run_program(name: str, parse: Callable[[], Verb]) -> int:
 
 
 def _nobody_reads() -> bool:
-    """Return whether standard output is a pipe whose reader, like `head`, has what it wanted."""
+    """Return whether standard output is a pipe whose reader is gone, like `head`."""
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     return any(event & select.POLLERR for _, event in poll.poll(0))

@@ -15,10 +15,12 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import FOLDER, JSON, SCENE, SIZE, parse_size
+from rfedge.arguments import FOLDER, JSON, SIZE, parse_size
 from rfedge.program import CONFIG, run_program
 
 __all__ = ["Build", "Plan", "Sheet", "main", "parse"]
+
+SCENE = arg(metavar="SCENE")
 
 
 @dataclass(frozen=True)

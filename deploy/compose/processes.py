@@ -2,13 +2,12 @@
 
 ``python deploy/compose/processes.py FOLDER [--minutes M] [--prometheus PROGRAM]``
 
-The commands are those of the compose file, word by word; only places differ. Each service gets a
+The commands are those of the compose file; only addresses and folders differ. Each service gets a
 loopback address of its own (127.77.0.N) in place of its host name, so that every port stays as it
 is, and a folder of its own in place of the container's root, where its mounts are symbolic links.
-Memory and CPU limits of the compose file are not applied. Servers of root are told to decode in a
-sandbox all the same: the containers have a user for that. Images of others are not started, except
-Prometheus, which is Debian's program. At the end it prints the CPU time of each service with its
-children, and of the whole machine.
+Memory and CPU limits of the compose file are not applied. Servers that run as root are told to
+decode in a sandbox, for which the containers have a user. Images of others are not started, except
+Prometheus, which is Debian's program.
 """
 
 from __future__ import annotations
@@ -29,12 +28,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import psutil
 import yaml
 
 ROOT = Path(__file__).parents[2]
 
-__all__ = ["Place", "Service", "main", "places_of", "read_services", "words_of"]
+__all__ = ["Location", "Service", "locations_of", "main", "read_services", "words_of"]
 
 OURS = "${RFEDGE_IMAGE}"
 START_TIMEOUT_S = 120.0
@@ -63,8 +61,8 @@ class Service:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a service runs: its loopback address, and the folder that is its root."""
+class Location:
+    """The loopback address of a service, and the folder that is its root."""
 
     address: str
     root: Path
@@ -73,7 +71,7 @@ class Place:
 def read_services(
     compose: dict[str, Any], environment: dict[str, str], names: tuple[str, ...] = ()
 ) -> dict[str, Service]:
-    """Return the services of our image and those of ``names``, with variables filled in."""
+    """Return the services of our image, and those of ``names``, with variables filled in."""
     services = {}
     for name, content in compose["services"].items():
         if content["image"] != OURS and name not in names:
@@ -92,7 +90,7 @@ def read_services(
 
 
 def _health(check: dict[str, Any] | None) -> str:
-    """Return what deploy/healthy.sh asks for, from its words: healthy PORT [PATH]."""
+    """Return the port and path of a health check, from its words: healthy PORT [PATH]."""
     if check is None:
         return ""
     _, _, port, *path = check["test"]
@@ -105,36 +103,36 @@ def _filled(text: str, environment: dict[str, str]) -> str:
     return filled.replace("$$", "$")
 
 
-def places_of(services: dict[str, Service], folder: Path) -> dict[str, Place]:
+def locations_of(services: dict[str, Service], folder: Path) -> dict[str, Location]:
     """Return an address and a root folder for each service."""
     return {
-        name: Place(f"127.77.0.{number}", folder / "roots" / name)
+        name: Location(f"127.77.0.{number}", folder / "roots" / name)
         for number, name in enumerate(services, start=1)
     }
 
 
-def words_of(service: Service, places: dict[str, Place]) -> list[str]:
+def words_of(service: Service, locations: dict[str, Location]) -> list[str]:
     """Return a service's command with addresses for host names and its own root for paths."""
     words = []
     in_hosts = False
     for word in service.command:
         in_hosts = word == "--hosts" or (in_hosts and not word.startswith("-"))
-        if in_hosts and word in places:
-            words.append(places[word].address)
+        if in_hosts and word in locations:
+            words.append(locations[word].address)
             continue
-        words.append(_placed(word, service, places))
+        words.append(_located(word, service, locations))
     return words
 
 
-def _placed(text: str, service: Service, places: dict[str, Place]) -> str:
-    own = places[service.name]
+def _located(text: str, service: Service, locations: dict[str, Location]) -> str:
+    own = locations[service.name]
     text = text.replace("0.0.0.0", own.address)
-    names = "|".join(sorted(map(re.escape, places), key=len, reverse=True))
-    text = re.sub(rf"\b({names})(?=:\d)", lambda found: places[found[1]].address, text)
+    names = "|".join(sorted(map(re.escape, locations), key=len, reverse=True))
+    text = re.sub(rf"\b({names})(?=:\d)", lambda found: locations[found[1]].address, text)
     if "--hosts" in text:
         before, _, after = text.partition("--hosts")
         hosts, end, rest = after.partition(";")
-        hosts = re.sub(names, lambda found: places[found[0]].address, hosts)
+        hosts = re.sub(names, lambda found: locations[found[0]].address, hosts)
         text = f"{before}--hosts{hosts}{end}{rest}"
     for target in service.mounts:
         top = "/" + target.split("/")[1]
@@ -142,7 +140,7 @@ def _placed(text: str, service: Service, places: dict[str, Place]) -> str:
     return text
 
 
-def prepare_root(service: Service, place: Place, folder: Path) -> None:
+def prepare_root(service: Service, location: Location, folder: Path) -> None:
     """Make the folder that stands for the container's root: a link for each mount."""
     for target, source in service.mounts.items():
         if source.startswith("."):
@@ -150,20 +148,20 @@ def prepare_root(service: Service, place: Place, folder: Path) -> None:
         else:
             to = folder / "volumes" / source
             to.mkdir(parents=True, exist_ok=True)
-        link = place.root / target.lstrip("/")
+        link = location.root / target.lstrip("/")
         link.parent.mkdir(parents=True, exist_ok=True)
         link.symlink_to(to)
 
 
-def prepare_prometheus(places: dict[str, Place], root: Path) -> list[str]:
-    """Write Prometheus's configuration with these places; return the words that start it."""
+def prepare_prometheus(locations: dict[str, Location], root: Path) -> list[str]:
+    """Write Prometheus's configuration with these locations; return the words that start it."""
     etc = root / "etc/prometheus"
     (etc / "targets").mkdir(parents=True)
     for name in ("prometheus.yml", "rules.yml"):
         shutil.copy(ROOT / "deploy/prometheus" / name, etc)
     for path in sorted((ROOT / "deploy/compose/targets").glob("*.json")):
         entries = [
-            {"targets": [f"{places[host].address}:{port}"], "labels": {"instance": target}}
+            {"targets": [f"{locations[host].address}:{port}"], "labels": {"instance": target}}
             for entry in json.loads(path.read_text())
             for target in entry["targets"]
             for host, port in (target.split(":"),)
@@ -206,15 +204,6 @@ class Processes:
                 time.sleep(0.2)
         raise RuntimeError(f"{name} is not up; see {self._folder / name}.log")
 
-    def cpu_s(self) -> dict[str, float]:
-        """Return the seconds of CPU that each process took so far, with its children."""
-        spent = {}
-        for name, process in self.running.items():
-            tree = psutil.Process(process.pid)
-            times = [part.cpu_times() for part in (tree, *tree.children(recursive=True))]
-            spent[name] = sum(time.user + time.system for time in times)
-        return spent
-
     def stop(self) -> None:
         """End every process that was started here."""
         for process in self.running.values():
@@ -227,55 +216,45 @@ class Processes:
 
 
 def run(folder: Path, minutes: float, prometheus: str) -> None:
-    """Start everything, wait, print the CPU time that it took, and stop."""
+    """Start everything, wait, and stop."""
     compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
     declared = dict(re.findall(r"^(\w+)=(.*)$", (ROOT / ".env").read_text(), re.MULTILINE))
     environment = {name: os.environ.get(name) or value for name, value in declared.items()}
     services = read_services(compose, environment)
     for name in ("urls", "watch"):
         services.pop(name)
-    places = places_of(services, folder)
+    locations = locations_of(services, folder)
     processes = Processes(folder)
     try:
         for service in services.values():
-            _start(service, places, processes, folder)
+            _start(service, locations, processes, folder)
         listen = f"--web.listen-address=127.0.0.1:{environment['PROMETHEUS_PORT']}"
-        words = prepare_prometheus(places, folder / "roots/prometheus")
+        words = prepare_prometheus(locations, folder / "roots/prometheus")
         processes.start("prometheus", [prometheus, *words, listen])
-        _report(processes, minutes)
+        time.sleep(60 * minutes)
     finally:
         processes.stop()
 
 
-def _start(service: Service, places: dict[str, Place], processes: Processes, folder: Path) -> None:
+def _start(
+    service: Service, locations: dict[str, Location], processes: Processes, folder: Path
+) -> None:
     """Start one service and wait until it is healthy, or done if it is a one-shot one."""
-    place = places[service.name]
-    prepare_root(service, place, folder)
-    words = words_of(service, places)
+    location = locations[service.name]
+    prepare_root(service, location, folder)
+    words = words_of(service, locations)
     if words[0] == "cav-agent":
         words.append(f"--report={folder / service.name}.jsonl")
     if words[0] == "mec-server" and os.geteuid() == 0:
         words.append("--sandbox-as-root")
     process = processes.start(service.name, words, service.environment)
     if service.lasting:
-        processes.wait_healthy(service.name, f"http://{place.address}{service.health}")
+        processes.wait_healthy(service.name, f"http://{location.address}{service.health}")
     else:
         del processes.running[service.name]
         if process.wait(START_TIMEOUT_S) != 0:
             raise RuntimeError(f"{service.name} failed; see {folder / service.name}.log")
-    print(f"{service.name} {place.address}", flush=True)
-
-
-def _report(processes: Processes, minutes: float) -> None:
-    """Wait, then print cores used: of each service, of all of them, and of the machine."""
-    before, begin_s, machine = processes.cpu_s(), time.monotonic(), psutil.cpu_times()
-    time.sleep(60 * minutes)
-    after, span_s, later = processes.cpu_s(), time.monotonic() - begin_s, psutil.cpu_times()
-    for name, spent_s in after.items():
-        print(f"{name:12} {(spent_s - before[name]) / span_s:6.3f} cores")
-    ours = (sum(after.values()) - sum(before.values())) / span_s
-    busy = (sum(later) - later.idle - later.iowait) - (sum(machine) - machine.idle - machine.iowait)
-    print(f"{'all':12} {ours:6.3f} cores; the machine {busy / span_s:.3f} of {os.cpu_count()}")
+    print(f"{service.name} {location.address}", flush=True)
 
 
 def main() -> None:

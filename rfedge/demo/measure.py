@@ -145,7 +145,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class DriveOutcome:
-    """What the processes reported of one drive, and how it was coded."""
+    """Reports of the processes about one drive, and the settings of its coding."""
 
     agent_rows: Sequence[Mapping[str, Any]]
     """The agent's report, a row a frame, in order."""
@@ -189,7 +189,7 @@ class DriveFigures:
     payload_bytes: int
     packet_bytes: int
     wire_bytes: int
-    """What the link carried from the vehicle."""
+    """Bytes that the link carried from the vehicle."""
     psnr_db: float
     ssim: float
     rf_psnr_db: float

@@ -1,4 +1,4 @@
-"""The sample street, its field, scene files and link profiles, wherever rfedge runs.
+"""Find the sample street, its field, scene files and link profiles, wherever rfedge runs.
 
 A checkout has them in ``samples/``; a wheel carries a copy inside this package (CMakeLists.txt).
 """
@@ -17,9 +17,9 @@ CHECKOUT = PACKAGED.parents[1] / "samples"
 def sample_path(name: str) -> Path:
     """Return where the sample ``name`` is: a file or folder such as ``street``, ``links/drive.up``.
 
-    That is ``samples/`` of the working folder if it has it, else of the checkout, else of the
-    wheel. A sample that is nowhere (the images carry none) is named in the working folder, for the
-    reader to report.
+    It is looked for in ``samples/`` of the working folder, then of the checkout, then of the wheel.
+    The path of a sample that is nowhere (images carry none) is in the working folder, so that the
+    reader's error names a place where the user can put it.
     """
     folders = (folder for folder in (HERE, CHECKOUT, PACKAGED) if (folder / name).exists())
     return next(folders, HERE) / name

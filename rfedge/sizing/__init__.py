@@ -1,1 +1,1 @@
-"""How large an uplink has to be: measured tables, and what follows of them."""
+"""Sizing of uplinks and processors, from measured tables."""

@@ -51,7 +51,7 @@ class LoopLimits:
 
 @dataclass(frozen=True)
 class LoopStatus:
-    """Where a run is: ``progress`` 0..1, the loss of the last iteration, the last measurement."""
+    """State of a run: ``progress`` 0..1, the last iteration's loss, the last measurement."""
 
     progress: float
     iteration: int

@@ -1,5 +1,4 @@
-"""What is in ``examples/`` runs; ``tests/docs/test_evaluation.py`` runs the codec alone, and
-``tests/experiments/test_benchmark.py`` what is handed in to the benchmark."""
+"""The examples run; ``tests/lab/test_benchmark.py`` runs those of the benchmark."""
 
 import asyncio
 import json
