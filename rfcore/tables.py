@@ -1,4 +1,4 @@
-"""Values of a JSON or TOML table, taken out by key and checked one by one.
+"""Take values out of a JSON or TOML table by key, and check them one by one.
 
 A ``Table`` knows where it stands in its document as a dotted path (``uplink.outage``). What is
 wrong with a value is raised as ``fail(path, problem)`` says, so that each format keeps its own

@@ -45,7 +45,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class TimedFix:
-    """What was found of a picture, and the processor time of this process that it took.
+    """The pose estimate of a picture, and the processor time of this process that it took.
 
     ``search_cpu_ms`` is 0 where no search was run.
     """

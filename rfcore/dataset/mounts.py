@@ -1,4 +1,4 @@
-"""Where a car carries its cameras: 18 places, which the CARLA recorder and streetgen both use.
+"""The 18 cameras of a car, which the CARLA recorder and streetgen both use.
 
 The published method names the number of cameras, not their places. These are three rows of six.
 Heights, reach and tilts follow the authors' later recorder (Maftej/rfdvc): low before the bumper

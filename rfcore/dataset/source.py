@@ -1,4 +1,4 @@
-"""What a reader finds on disk, before anything is changed: cameras, pictures, points.
+"""Contents of a dataset as a reader finds them on disk: cameras, pictures, points.
 
 Poses are world_from_cam with OpenCV camera axes, float64, in the dataset's own world; pictures have
 the lens they were taken with. ``rfcore.dataset.assemble`` makes a ``Dataset`` of it.
@@ -65,10 +65,10 @@ class SourcePoints:
 class Source:
     """Everything one reader found.
 
-    ``file`` says what there is; ``sorted_out`` counts pictures it lists that were deleted on
-    purpose, by the rules of its format; ``exposure_varies`` where it says that the camera chose
-    exposure or white balance anew for each picture; ``anchor`` where it says what point
-    of its world is where on the Earth.
+    ``file`` is the one that describes it. ``sorted_out`` counts pictures that are listed but were
+    deleted on purpose, by the rules of the format. ``exposure_varies`` is true where the dataset
+    says that the camera chose exposure or white balance anew for each picture. ``anchor`` says
+    where on the Earth its world is, if the dataset does.
     """
 
     file: Path

@@ -78,7 +78,7 @@ def _mixed(flat: Rgb, first: NDArray[np.intp], step: int, share: F32) -> F32:
 
 @lru_cache(maxsize=CACHED_MAPS)
 def _source_map(intrinsics: Intrinsics, lens: Lens) -> SourceMap:
-    """Where each pixel centre of the pinhole comes from; kept, as all frames share it."""
+    """Return where each pixel centre of the pinhole comes from; cached, as all frames share it."""
     k = intrinsics
     pinhole = pinhole_of(intrinsics, lens)
     u, v = np.meshgrid(np.arange(k.width_px) + 0.5, np.arange(k.height_px) + 0.5)
@@ -102,7 +102,7 @@ def _edge_centres(k: Intrinsics) -> F64:
 
 
 def _all_inside(xy: F64, k: Intrinsics, lens: Lens) -> bool:
-    """Whether the lens images all directions onto pixel centres or between them."""
+    """Return whether the lens images all directions onto pixel centres or between them."""
     if np.hypot(xy[:, 0], xy[:, 1]).max() > lens.max_radius:
         return False
     u, v = _pixels(lens.distort(xy), k).T

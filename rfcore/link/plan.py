@@ -1,4 +1,4 @@
-"""What a link is made of, per direction; how a file declares it; and a run on a virtual clock.
+"""Describe a link per direction, read it from a file, and run it on a virtual clock.
 
 An impairment changes how a link transmits (a trace, an outage) or adds to its delay (jitter, a
 recorded delay). Randomness comes from a seed: every impairment of every direction draws from its
@@ -43,7 +43,14 @@ from rfcore.link.shaper import (
 )
 from rfcore.tables import Range, Table
 
-__all__ = ["Arrival", "DirectionPlan", "Impairment", "LinkPlan", "delivery_times", "read_link"]
+__all__ = [
+    "Arrival",
+    "DirectionPlan",
+    "Impairment",
+    "LinkPlan",
+    "delivery_times",
+    "read_link",
+]
 
 UNBOUNDED_BYTES = 2**62
 MAX_QUEUE_KIB = 1 << 20

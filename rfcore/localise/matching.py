@@ -87,7 +87,8 @@ def grey(rgb: U8) -> U8:
 def find_features(luma: U8, most: int, halvings: int = 0) -> Features:
     """Return at most ``most`` features of a picture uint8 [H, W], the strongest.
 
-    ``halvings``: of the picture's resolution before; each takes three quarters of the time away.
+    The picture's resolution is halved ``halvings`` times before; each saves three quarters of the
+    time.
     """
     for _ in range(halvings):
         luma = halved(luma)

@@ -95,10 +95,10 @@ class SensorBias:
         )
 
     def prior(self, measured: PoseMeasurement, rotation: Pose | None) -> PosePrior | None:
-        """Return where the camera is by a measurement, its bias taken away.
+        """Return where the camera is by a measurement, with the bias taken away.
 
-        ``rotation``: a pose to take the rotation from where none was measured; without one there is
-        no prior.
+        Where no rotation was measured it is that of the pose ``rotation``; without both there is no
+        prior.
         """
         at = self.at(measured.time_ns)
         stated = _stated(measured)
@@ -186,10 +186,10 @@ class MeasuredPoses:
     def prior(
         self, time_ns: int, motion: Motion | None, facing: Pose | None, widened: float
     ) -> PosePrior | None:
-        """Return where a camera is expected at ``time_ns``; ``None`` where nothing tells.
+        """Return where the camera is expected at ``time_ns``; ``None`` where nothing tells.
 
-        ``facing``: takes the place of a rotation that was not measured. ``widened``: factor of the
-        standard deviations.
+        ``facing`` takes the place of a rotation that was not measured. ``widened`` is a factor of
+        the standard deviations.
         """
         measured = self.newest
         if measured is None:

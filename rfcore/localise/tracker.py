@@ -1,4 +1,4 @@
-"""The camera's pose from picture to picture: Lost -> Localising -> Tracking, or lost again.
+"""Track a camera's pose from picture to picture: Lost -> Localising -> Tracking, or lost again.
 
 A machine without clock, threads or I/O. Every picture is handed over with its capture time; what
 sensors measured is handed over as it comes. The answer to a picture is a ``PoseEstimate``: the

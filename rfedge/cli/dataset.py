@@ -1,4 +1,4 @@
-"""``rfedge dataset``: datasets converted, posed by structure from motion, or recorded."""
+"""``rfedge dataset``: convert datasets, find poses by structure from motion, or record drives."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class DatasetConvert:
     every: int = 1
     """Take each n-th picture."""
     offset: int = 0
-    """Leave out the first pictures, so many."""
+    """Leave out so many of the first pictures."""
 
     def run(self) -> None:
         """Convert; the folder appears when all of it is there."""
@@ -64,7 +64,7 @@ class DatasetSplit:
     dataset: Annotated[Path, Positional, DATASET]
     """A dataset of any format; lenses are undistorted."""
     out: Annotated[Path, FOLDER]
-    """The folder to make: a dataset a tile, and tiles.json, which lists them."""
+    """The folder to make: one dataset for each tile, and tiles.json, which lists them."""
     length: Annotated[float, arg(metavar="M")]
     """Longest side of a tile's ground, m."""
     overlap: Annotated[float, arg(metavar="M")] = 10.0
@@ -72,7 +72,7 @@ class DatasetSplit:
     fewest: int = 8
     """Pictures that a tile must have."""
     points_within: Annotated[float, arg(metavar="M")] = 60.0
-    """A tile has the dataset's points on its ground and so far around, m."""
+    """A tile takes the dataset's points on its ground and within this distance of it, m."""
 
     def run(self) -> None:
         """Split; the folder appears when all of it is there."""
@@ -92,28 +92,28 @@ class DatasetPoses:
 
     images: Annotated[Path, Positional, arg(metavar="FOLDER|VIDEO")]
     """Folder of pictures (PNG, JPEG, WebP), in order of their names; or a video, of which the
-    sharpest frames are taken. Stopped, it goes on with those that are in OUT.frames."""
+    sharpest frames are taken. A run that was stopped goes on with those in OUT.frames."""
     out: Annotated[Path, FOLDER]
     """The folder to make: pictures, points and transforms.json."""
     register_to: Annotated[Path | None, DATASET] = None
-    """A dataset whose world the poses shall be in; its poses and cameras are held. Or a field
-    (an archive or a name), where its pictures are not at hand: the camera must be given then."""
+    """Find poses in the world of this dataset, whose poses and cameras are held; or in that of a
+    field (an archive or a name), if its pictures are not at hand: then give the camera."""
     camera: Literal["dataset", "estimate"] = "dataset"
     """With --register-to: take the dataset's camera, or estimate the intrinsics."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "SIMPLE_RADIAL"
     """COLMAP camera model of the new pictures, where it is not the dataset's camera."""
     parameters: Annotated[tuple[float, ...], arg(metavar="NUMBER ...")] = ()
-    """Its known parameters in COLMAP's order, which are held; default: estimated."""
+    """Known parameters of that model in COLMAP's order, which are held; default: estimated."""
     up: Literal["z", "y", "-y"] = "z"
     """Which axis is up in the field registered to."""
     per_second: float = 2.0
-    """Of a video: how many pictures a second."""
+    """Pictures to take of each second of a video."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Match all pairs, or neighbours in a long drive; auto: neighbours in a video, else all."""
     max_side_px: int = 1600
-    """Longest side at which features are looked for."""
+    """Longest side of pictures in which features are looked for."""
     features: int = 8192
-    """At most so many features a picture."""
+    """Most features of a picture."""
     threads: int = 2
     """Threads."""
     seed: int = 1
@@ -181,15 +181,15 @@ class DatasetPoses:
         from rich.console import Console
 
         from rfcore.dataset.read import is_video
-        from rfedge.datasets.colmap_features import Matching, PoseSettings, SharedCamera
+        from rfedge.datasets.colmap_features import PoseSettings
         from rfedge.datasets.poses import pose_dataset
 
         matching = self.matching
         if matching == "auto":
             matching = "sequential" if is_video(self.images) else "exhaustive"
         settings = PoseSettings(
-            matching=Matching(matching),
-            camera=SharedCamera(self.camera),
+            matching=matching,
+            camera=self.camera,
             model=self.camera_model,
             parameters=self.parameters,
             max_side_px=self.max_side_px,
@@ -204,7 +204,7 @@ class DatasetPoses:
 
 @contextmanager
 def _shown(console: Console) -> Iterator[Callable[[str], None]]:
-    """Show what is told: in one changing line on a terminal, line by line in a log."""
+    """Show progress: in one changing line on a terminal, line by line in a log."""
     if not console.is_terminal:
         yield lambda text: console.print(f"  {text}", highlight=False)
         return
@@ -249,9 +249,9 @@ class DatasetRecordCarla:
         from rfcore.errors import RfedgeError
         from rfcore.extras import needs
         from rfcore.files import whole_folder
-        from rfedge.datasets.carla import Recorder, RecordSettings
+        from rfedge.datasets.carla import CarlaRecorder, CarlaRecordSettings
 
-        settings = RecordSettings(
+        settings = CarlaRecordSettings(
             spawn=self.spawn,
             stations=self.stations,
             spacing_m=self.spacing_m,
@@ -269,7 +269,7 @@ class DatasetRecordCarla:
                 client = carla.Client(self.host, self.port)
                 client.set_timeout(self.timeout_s)
                 world = client.load_world(self.town) if self.town else client.get_world()
-                count = Recorder(carla, world, settings).record(folder)
+                count = CarlaRecorder(carla, world, settings).record(folder)
             except RuntimeError as error:
                 raise RfedgeError(f"CARLA at {self.host}:{self.port}: {error}") from error
         print(f"{self.out}: {count} pictures")

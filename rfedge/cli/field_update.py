@@ -1,4 +1,4 @@
-"""``rfedge field update`` and ``disagree``: what passes of vehicles teach about a field."""
+"""``rfedge field update`` and ``disagree``: learn from recorded passes what has changed."""
 
 from __future__ import annotations
 

@@ -30,7 +30,13 @@ from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import write_png
 
-__all__ = ["RecordSettings", "Recorder", "intrinsics_of_fov", "point_from_carla", "pose_from_carla"]
+__all__ = [
+    "CarlaRecordSettings",
+    "CarlaRecorder",
+    "intrinsics_of_fov",
+    "point_from_carla",
+    "pose_from_carla",
+]
 
 
 def pose_from_carla(world_from_sensor: Sequence[Sequence[float]]) -> Pose:
@@ -63,8 +69,8 @@ SETTLING_TICKS = 2
 
 
 @dataclass(frozen=True)
-class RecordSettings:
-    """Where to drive and what to record; ``spawn`` numbers the map's spawn points."""
+class CarlaRecordSettings:
+    """Options of a recording; ``spawn`` is the index of one of the map's spawn points."""
 
     spawn: int = 0
     stations: int = 20
@@ -86,10 +92,10 @@ class RecordSettings:
                 raise InvalidInput(name, f"{getattr(self, name)} must be above 0")
 
 
-class Recorder:
-    """Records in ``world`` with the client library's module ``carla``."""
+class CarlaRecorder:
+    """Records in ``world`` with the client library, the module ``carla``."""
 
-    def __init__(self, carla: Any, world: Any, settings: RecordSettings) -> None:
+    def __init__(self, carla: Any, world: Any, settings: CarlaRecordSettings) -> None:
         self._carla = carla
         self._world = world
         self._settings = settings
@@ -116,7 +122,7 @@ class Recorder:
         return len(written)
 
     def _stations(self) -> list[Any]:
-        """Transforms on the lane and, for the way back, on the lane of the other direction."""
+        """Return transforms on the lane and, for the way back, on that of the other direction."""
         street = self._world.get_map()
         spawns = street.get_spawn_points()
         if self._settings.spawn >= len(spawns):
@@ -232,6 +238,6 @@ def _transform(carla: Any, mount: Mount) -> Any:
 
 
 def _raised(carla: Any, transform: Any) -> Any:
-    """A waypoint lies on the road; a car spawned there would collide with it."""
+    """Return the transform of a waypoint raised off the road, which a car would collide with."""
     at = transform.location
     return carla.Transform(carla.Location(at.x, at.y, at.z + 0.3), transform.rotation)

@@ -1,4 +1,4 @@
-"""Features and matches of all pictures, in a COLMAP database; what can be chosen about them.
+"""Find and match the features of all pictures, in a COLMAP database.
 
 Pictures lie under one root: those of the dataset in ``known``, as PNG, the new ones in ``new``.
 COLMAP's cameras and poses have the same axes and pixel centres as ours; its poses are
@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -29,10 +28,8 @@ with needs("colmap"):
     import pycolmap
 
 __all__ = [
-    "Matching",
+    "ColmapWorkspace",
     "PoseSettings",
-    "SharedCamera",
-    "Workplace",
     "add_known",
     "add_new",
     "camera_parameters",
@@ -47,37 +44,25 @@ __all__ = [
 T = TypeVar("T")
 
 
-class Matching(StrEnum):
-    """Which pairs of pictures are matched."""
-
-    EXHAUSTIVE = "exhaustive"
-    SEQUENTIAL = "sequential"
-
-
-class SharedCamera(StrEnum):
-    """Where the intrinsics of new pictures come from when there is a dataset to register to."""
-
-    DATASET = "dataset"
-    ESTIMATE = "estimate"
-
-
 @dataclass(frozen=True)
 class PoseSettings:
-    """How poses are found."""
+    """Options of structure from motion."""
 
-    matching: Matching = Matching.EXHAUSTIVE
-    camera: SharedCamera = SharedCamera.DATASET
+    matching: Literal["exhaustive", "sequential"] = "exhaustive"
+    """Match all pairs of pictures, or neighbours only."""
+    camera: Literal["dataset", "estimate"] = "dataset"
+    """Take the intrinsics of new pictures from the dataset to register to, or estimate them."""
     model: str = "SIMPLE_RADIAL"
     """COLMAP's name of the camera model of new pictures."""
     parameters: tuple[float, ...] = ()
-    """Its values in COLMAP's order, which are then held; empty: estimated."""
+    """Its parameters in COLMAP's order, which are then held; they are estimated if it is empty."""
     max_side_px: int = 1600
     """Pictures are reduced to this longest side to find features."""
     features: int = 8192
-    """At most so many features a picture."""
+    """Most features of a picture."""
     threads: int = 2
     seed: int = 1
-    """Of RANSAC."""
+    """Seed of RANSAC."""
 
     def __post_init__(self) -> None:
         needed = parameter_count("model", self.model)
@@ -122,7 +107,7 @@ def pose_from_colmap(cam_from_world: pycolmap.Rigid3d) -> Pose:
 
 
 @dataclass(frozen=True)
-class Workplace:
+class ColmapWorkspace:
     """A folder with the pictures and the database."""
 
     root: Path
@@ -133,45 +118,47 @@ class Workplace:
         return self.root / "database.db"
 
 
-def add_known(place: Workplace, known: Sequence[SourcePicture], settings: PoseSettings) -> None:
+def add_known(
+    workspace: ColmapWorkspace, known: Sequence[SourcePicture], settings: PoseSettings
+) -> None:
     """Add a dataset's pictures with their own cameras, as ``known/000000.png`` and so on."""
-    (place.root / "known").mkdir()
+    (workspace.root / "known").mkdir()
     groups: dict[SourceCamera, list[str]] = {}
     for i, picture in enumerate(known):
         name = f"known/{i:06d}.png"
-        write_png(place.root / name, picture.read())
+        write_png(workspace.root / name, picture.read())
         groups.setdefault(picture.camera, []).append(name)
     for camera, names in groups.items():
         options = pycolmap.ImageReaderOptions()
         options.camera_model, parameters = camera_parameters(camera)
         options.camera_params = ",".join(repr(float(value)) for value in parameters)
-        _extract(place, names, options, settings)
+        _extract(workspace, names, options, settings)
 
 
-def add_new(place: Workplace, names: Sequence[str], settings: PoseSettings) -> None:
+def add_new(workspace: ColmapWorkspace, names: Sequence[str], settings: PoseSettings) -> None:
     """Add the new pictures: with the dataset's camera, or with one that is to be estimated."""
     options = pycolmap.ImageReaderOptions()
     options.camera_model = settings.model
     options.camera_params = ",".join(map(repr, settings.parameters))
-    with pycolmap.Database.open(place.database) as database:
+    with pycolmap.Database.open(workspace.database) as database:
         cameras = database.read_all_cameras()
-    if cameras and settings.camera is SharedCamera.DATASET:
-        options.existing_camera_id = _shared_camera(place, names, cameras)
-    _extract(place, names, options, settings)
+    if cameras and settings.camera == "dataset":
+        options.existing_camera_id = _shared_camera(workspace, names, cameras)
+    _extract(workspace, names, options, settings)
 
 
-def match(place: Workplace, settings: PoseSettings) -> None:
+def match(workspace: ColmapWorkspace, settings: PoseSettings) -> None:
     """Match features and keep what two-view geometry confirms."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, settings.threads
-    sequential = settings.matching is Matching.SEQUENTIAL
+    sequential = settings.matching == "sequential"
 
     def seeded(*arguments: Any, **named: Any) -> None:
         pycolmap.set_random_seed(settings.seed)  # of the thread that matches
         run = pycolmap.match_sequential if sequential else pycolmap.match_exhaustive
         run(*arguments, **named)
 
-    cancellable(seeded, place.database, options, device=pycolmap.Device.cpu)
+    cancellable(seeded, workspace.database, options, device=pycolmap.Device.cpu)
 
 
 def cancellable(call: Callable[..., T], *arguments: Any, **named: Any) -> T:
@@ -191,7 +178,7 @@ def cancellable(call: Callable[..., T], *arguments: Any, **named: Any) -> T:
 
 
 def _shared_camera(
-    place: Workplace, names: Sequence[str], cameras: Sequence[pycolmap.Camera]
+    workspace: ColmapWorkspace, names: Sequence[str], cameras: Sequence[pycolmap.Camera]
 ) -> int:
     if len(cameras) > 1:
         raise DatasetError(
@@ -199,7 +186,7 @@ def _shared_camera(
         )
     size_px = (cameras[0].width, cameras[0].height)
     for name in names:
-        found = picture_size_px(place.root / name)
+        found = picture_size_px(workspace.root / name)
         if found != size_px:
             raise DatasetError(
                 f"{Path(name).name}: {found} px is not the {size_px} px of the dataset's camera; "
@@ -209,7 +196,7 @@ def _shared_camera(
 
 
 def _extract(
-    place: Workplace,
+    workspace: ColmapWorkspace,
     names: Sequence[str],
     reader: pycolmap.ImageReaderOptions,
     settings: PoseSettings,
@@ -220,8 +207,8 @@ def _extract(
     options.sift.max_num_features = settings.features
     cancellable(
         pycolmap.extract_features,
-        place.database,
-        place.root,
+        workspace.database,
+        workspace.root,
         list(names),
         pycolmap.CameraMode.SINGLE,
         reader,

@@ -1,4 +1,4 @@
-"""A dataset of any format into pinhole pictures with a ``transforms.json``."""
+"""Convert a dataset of any format into pinhole pictures with a ``transforms.json``."""
 
 from __future__ import annotations
 

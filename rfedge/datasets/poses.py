@@ -1,4 +1,4 @@
-"""From a folder of pictures to a dataset with poses, in a new world or in a dataset's own.
+"""Make a dataset with poses of a folder of pictures, in a new world or in a dataset's own.
 
 To register, points are triangulated from the dataset's pictures at their given poses; the new
 pictures are then resected against them and refined, while every given pose and camera is held.
@@ -25,9 +25,8 @@ from rfcore.errors import DatasetError
 from rfcore.extras import needs
 from rfcore.files import whole_folder
 from rfedge.datasets.colmap_features import (
+    ColmapWorkspace,
     PoseSettings,
-    SharedCamera,
-    Workplace,
     add_known,
     add_new,
     cancellable,
@@ -40,17 +39,17 @@ from rfedge.datasets.colmap_features import (
 with needs("colmap"):
     import pycolmap
 
-__all__ = ["Solution", "Tell", "pose_dataset", "solve_poses"]
+__all__ = ["PlacedPictures", "Tell", "pose_dataset", "solve_poses"]
 
 Tell = Callable[[str], None]
-"""Told in words what is being done, for whoever waits."""
+"""Called with a line that says what is being done."""
 MIN_PICTURES = 3
 ANY_FORWARD_MOTION = 1.0
 """A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
 
 
-def _nobody(_: str) -> None:
-    """Tell nobody."""
+def _ignore(_: str) -> None:
+    """Do nothing with a line of progress."""
 
 
 def pose_dataset(
@@ -58,7 +57,7 @@ def pose_dataset(
     out: Path,
     register_to: Path | None,
     settings: PoseSettings,
-    tell: Tell = _nobody,
+    tell: Tell = _ignore,
 ) -> str:
     """Write ``out`` with the pictures that could be placed; return one line about it.
 
@@ -93,7 +92,7 @@ def _pictures(images: Path, at_least: int) -> Sequence[Path]:
     return paths
 
 
-def _write(folder: Path, root: Path, names: Sequence[str], solution: Solution) -> None:
+def _write(folder: Path, root: Path, names: Sequence[str], solution: PlacedPictures) -> None:
     (folder / "images").mkdir()
     written = []
     for name in names:
@@ -105,7 +104,7 @@ def _write(folder: Path, root: Path, names: Sequence[str], solution: Solution) -
     write_transforms(folder, written, solution.points if len(solution.points.xyz_m) else None)
 
 
-def _summary(out: Path, solution: Solution) -> str:
+def _summary(out: Path, solution: PlacedPictures) -> str:
     line = f"{out}: {len(solution.placed)} pictures placed, {len(solution.points.xyz_m):,} points"
     if not solution.lost:
         return line
@@ -113,7 +112,7 @@ def _summary(out: Path, solution: Solution) -> str:
 
 
 @dataclass(frozen=True)
-class Solution:
+class PlacedPictures:
     """Cameras and world_from_cam by name for the pictures that were placed, and the points."""
 
     placed: Mapping[str, tuple[SourceCamera, Pose]]
@@ -127,31 +126,31 @@ def solve_poses(
     known: Sequence[SourcePicture],
     settings: PoseSettings,
     tell: Tell,
-) -> Solution:
+) -> PlacedPictures:
     """Place the pictures ``root / name``; with ``known`` pictures, in their world.
 
     Raises ``DatasetError`` when fewer than two pictures, or none of the new ones, can be placed.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    place = Workplace(root)
+    workspace = ColmapWorkspace(root)
     origin = chosen_origin(known) if known else TileOrigin()
     if known:
         tell(f"features of the dataset's {len(known)} pictures")
-        add_known(place, known, settings)
+        add_known(workspace, known, settings)
     tell(f"features of {len(names)} new pictures")
-    add_new(place, names, settings)
+    add_new(workspace, names, settings)
     tell(f"matching {len(known) + len(names)} pictures ({settings.matching})")
-    match(place, settings)
-    placing = _Placing(tell, len(known) + len(names))
+    match(workspace, settings)
+    placing = _PlacingProgress(tell, len(known) + len(names))
     if known:
-        model = _registered(place, known, origin, settings, placing)
+        model = _registered(workspace, known, origin, settings, placing)
     else:
-        model = _alone(place, settings, placing)
+        model = _alone(workspace, settings, placing)
     return _solution(model, names, origin)
 
 
-class _Placing:
-    """Counts the pictures that COLMAP has placed and tells it."""
+class _PlacingProgress:
+    """Counts the pictures that COLMAP has placed and reports the count."""
 
     def __init__(self, tell: Tell, total: int) -> None:
         self.tell = tell
@@ -167,16 +166,18 @@ class _Placing:
         self.tell(f"placing pictures: {self._placed} of {self._total}")
 
 
-def _alone(place: Workplace, settings: PoseSettings, placing: _Placing) -> pycolmap.Reconstruction:
-    folder = place.root / "model"
+def _alone(
+    workspace: ColmapWorkspace, settings: PoseSettings, placing: _PlacingProgress
+) -> pycolmap.Reconstruction:
+    folder = workspace.root / "model"
     folder.mkdir()
     options = _options(settings)
     options.ba_refine_focal_length = options.ba_refine_extra_params = not settings.parameters
     options.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
     models = cancellable(
         pycolmap.incremental_mapping,
-        place.database,
-        place.root,
+        workspace.database,
+        workspace.root,
         folder,
         options,
         initial_image_pair_callback=lambda: placing.start_from(2),
@@ -188,40 +189,40 @@ def _alone(place: Workplace, settings: PoseSettings, placing: _Placing) -> pycol
 
 
 def _registered(
-    place: Workplace,
+    workspace: ColmapWorkspace,
     known: Sequence[SourcePicture],
     origin: TileOrigin,
     settings: PoseSettings,
-    placing: _Placing,
+    placing: _PlacingProgress,
 ) -> pycolmap.Reconstruction:
-    given = _given_poses(place, known, origin)
+    given = _given_poses(workspace, known, origin)
     held = set(given.cameras)
     options = _options(settings)
     options.fix_existing_frames = True
     options.constant_cameras = held
-    if settings.camera is SharedCamera.DATASET or settings.parameters:
+    if settings.camera == "dataset" or settings.parameters:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
     for name in ("given", "model"):
-        (place.root / name).mkdir()
+        (workspace.root / name).mkdir()
     placing.tell("points of the dataset's pictures at their given poses")
     placing.start_from(len(known))
     cancellable(
         pycolmap.triangulate_points,
         given,
-        place.database,
-        place.root,
-        place.root / "given",
+        workspace.database,
+        workspace.root,
+        workspace.root / "given",
         True,
         options,
         False,
     )
     models = cancellable(
         pycolmap.incremental_mapping,
-        place.database,
-        place.root,
-        place.root / "model",
+        workspace.database,
+        workspace.root,
+        workspace.root / "model",
         options,
-        place.root / "given",
+        workspace.root / "given",
         next_image_callback=placing.one_more,
     )
     if not models:
@@ -230,11 +231,11 @@ def _registered(
 
 
 def _given_poses(
-    place: Workplace, known: Sequence[SourcePicture], origin: TileOrigin
+    workspace: ColmapWorkspace, known: Sequence[SourcePicture], origin: TileOrigin
 ) -> pycolmap.Reconstruction:
-    """The dataset's cameras and poses under the ids the database gave them."""
+    """Return the dataset's cameras and poses under the ids the database gave them."""
     model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(place.database) as database:
+    with pycolmap.Database.open(workspace.database) as database:
         cameras, images = database.read_all_cameras(), database.read_all_images()
     poses = {f"known/{i:06d}.png": picture.world_from_cam for i, picture in enumerate(known)}
     given = [image for image in images if image.name in poses]
@@ -254,7 +255,9 @@ def _options(settings: PoseSettings) -> pycolmap.IncrementalPipelineOptions:
     return options
 
 
-def _solution(model: pycolmap.Reconstruction, names: Sequence[str], origin: TileOrigin) -> Solution:
+def _solution(
+    model: pycolmap.Reconstruction, names: Sequence[str], origin: TileOrigin
+) -> PlacedPictures:
     placed = {}
     for image in model.images.values():
         if image.has_pose and image.name in names:
@@ -264,7 +267,7 @@ def _solution(model: pycolmap.Reconstruction, names: Sequence[str], origin: Tile
     if not placed:
         raise DatasetError(f"none of the {len(names)} pictures could be placed; do they overlap?")
     lost = tuple(name for name in names if name not in placed)
-    return Solution(placed, lost, _points(model, origin))
+    return PlacedPictures(placed, lost, _points(model, origin))
 
 
 def _points(model: pycolmap.Reconstruction, origin: TileOrigin) -> SourcePoints:

@@ -1,4 +1,4 @@
-"""A long recording cut into tiles of ground that overlap: a dataset each, and ``tiles.json``.
+"""Cut a long recording into tiles of ground that overlap: one dataset each, and ``tiles.json``.
 
 The ground below the cameras, axis-parallel in the dataset's own world (x east, y north), is cut
 into equal rectangles whose sides are at most ``length_m``. A tile takes every picture that was
@@ -33,23 +33,23 @@ __all__ = ["LIST_NAME", "SplitSettings", "SplitTile", "read_tiles", "split_datas
 LIST_NAME = "tiles.json"
 MOST_TILES = 1000
 LEAST_SIDE_M = 1.0
-"""Of the ground of a recording along a straight line, across it."""
+"""Least width of the ground of a recording along a straight line."""
 Area = tuple[float, float, float, float]
 """West, south, east and north side, m."""
 
 
 @dataclass(frozen=True)
 class SplitSettings:
-    """How a recording is cut."""
+    """Options of a split."""
 
     length_m: float
     """Longest side of a tile's ground."""
     overlap_m: float
-    """How far two tiles side by side share their pictures."""
+    """Width of the ground whose pictures two neighbouring tiles share."""
     fewest: int = 8
-    """Pictures that a tile has at least."""
+    """Least number of pictures of a tile."""
     points_m: float = 60.0
-    """A tile has the dataset's points on its ground and so far around."""
+    """A tile takes the dataset's points on its ground and within this distance of it."""
 
     def __post_init__(self) -> None:
         if not 0 < self.length_m < math.inf:

@@ -1,4 +1,4 @@
-"""The sharpest picture of each stretch of a video, as files: what structure from motion needs.
+"""Write the sharpest picture of each stretch of a video, as structure from motion needs them.
 
 Sharpness is the variance of the luma's Laplacian (Pech-Pacheco et al., ICPR 2000), compared among
 neighbours only: it depends on what is shown. A stretch's picture appears whole when the stretch has
@@ -31,8 +31,8 @@ ABOUT = "video.json"
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """What the pictures of a folder were chosen from, and how many a second."""
+class FrameSelection:
+    """The video that the pictures of a folder were chosen from, and how many a second."""
 
     video: str
     bytes: int
@@ -40,7 +40,7 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class SharpestFrame:
     """The frame to keep of one stretch of the video."""
 
     number: int
@@ -59,7 +59,7 @@ def sharpest_frames(
     if not 0 < per_second <= MAX_PER_SECOND:
         raise InvalidInput("per-second", f"{per_second:g} is outside 0..{MAX_PER_SECOND:g}")
     try:
-        _claim(folder, Chosen(video.name, video.stat().st_size, per_second))
+        _claim(folder, FrameSelection(video.name, video.stat().st_size, per_second))
         done = _first_missing(folder)
         with av.open(str(video)) as container:
             stream = container.streams.video[0]
@@ -81,7 +81,7 @@ def sharpness(luma: NDArray[np.uint8]) -> float:
     return float(laplacian.var())
 
 
-def _claim(folder: Path, chosen: Chosen) -> None:
+def _claim(folder: Path, chosen: FrameSelection) -> None:
     about = folder / ABOUT
     content = json.dumps(asdict(chosen))
     if not folder.exists():
@@ -130,9 +130,9 @@ def _frames(
 
 def _stretches(
     frames: Iterator[tuple[float, av.VideoFrame]], per_second: float
-) -> Iterator[Stretch]:
+) -> Iterator[SharpestFrame]:
     """Yield the sharpest frame of each stretch that has any."""
-    best: tuple[float, Stretch] | None = None
+    best: tuple[float, SharpestFrame] | None = None
     for time_s, frame in frames:
         number = int(time_s * per_second + 1e-6)
         score = sharpness(_luma(frame))
@@ -140,7 +140,7 @@ def _stretches(
             yield best[1]
             best = None
         if best is None or score > best[0]:
-            best = (score, Stretch(number, frame))
+            best = (score, SharpestFrame(number, frame))
     if best is not None:
         yield best[1]
 

@@ -1,4 +1,4 @@
-"""Does a field show what a drive's camera saw? If not: which known convention would make it fit?
+"""Check whether a field shows what a drive's camera saw, and which convention would make it fit.
 
 Two things are tried. *Conventions*: a field in a normalised frame, with other axes or in other
 units renders black or fog without a hint. Each ``Convention`` is one guess at what is wrong: how
@@ -57,7 +57,7 @@ class Convention:
 
     @property
     def blames_the_drive(self) -> bool:
-        """Whether the drive's poses are wrong, not the field's frame."""
+        """Whether it says that the drive's poses are wrong, not the field's frame."""
         return self.inverted_poses or self.opengl_axes
 
     def camera(self, camera: Camera) -> Camera:
@@ -130,12 +130,12 @@ PROBES = 2
 PROBE_WIDTH_PX = 96
 FINALISTS = 8
 FITS_DB = 18.0
-"""A field of the place, seen as it is, is above this even with vehicles it has never seen (21.3 dB
-in the published figures); other places and frames gave 6 to 14 dB."""
+"""A field of the place in the right frame is above this, even with vehicles it has never seen (21.3
+dB in the published figures); other places and frames gave 6 to 14 dB."""
 GAIN_DB = 3.0
-"""So much better than as given another convention must be to be believed below ``FITS_DB``."""
+"""Another convention must be so much better to be believed below ``FITS_DB``."""
 MODE_GAIN_DB = 0.5
-"""So much better the mode that the field does not state must be to be believed. A field drawn in
+"""The mode that the field does not state must be so much better to be believed. A field drawn in
 the wrong mode lost 4.2 dB on the first sample; between modes that both fit there is less."""
 MAX_PAIR_WIDTH_PX = 640
 
@@ -167,11 +167,11 @@ class ModeFit:
 
 @dataclass(frozen=True)
 class Fit:
-    """How well the field fits the drive under one convention.
+    """The fit of a field to a drive under one convention.
 
-    ``psnr_db`` is in the mode that fits, ``as_given_db`` as the field says it is; ``fits`` says
-    whether it is believed; ``tried`` how many conventions there were to choose from. ``mode`` is
-    ``None`` for a field that is not made of splats.
+    ``psnr_db`` is in the mode that fits, ``as_given_db`` in the field's own frame and mode.
+    ``fits`` says whether the fit is good enough to be believed, ``tried`` how many conventions
+    there were to choose from. ``mode`` is ``None`` for a field that is not made of splats.
     """
 
     convention: Convention

@@ -1,9 +1,9 @@
-"""A field in words and figures, as ``rfedge field info`` prints it.
+"""Describe a field in words and figures, for ``rfedge field info`` and ``disagree``.
 
 The figures are what the header states and what a frame of each level of detail takes on this
-machine. ``disagreement_picture`` shows an operator where a field and the street disagree: the
-render is brought to the frame's light first, each plane by one gain and offset, so that what is
-red has changed on the street, or was never learnt, and is not the hour of the day.
+machine. ``disagreement_picture`` shows an operator where a field and the street disagree. The
+render is brought to the frame's light first, each plane by one gain and offset; what is red then
+has changed on the street, or was never learnt, and is not due to the hour of the day.
 """
 
 from __future__ import annotations

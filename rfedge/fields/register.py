@@ -1,4 +1,4 @@
-"""Poses of new pictures in a field, where its own pictures are no longer at hand.
+"""Find the poses of new pictures in a field whose own pictures are no longer at hand.
 
 The first picture is looked for all over the field: at places of a grid around its middle, in eight
 directions; then each picture is looked for from where the last one was found. After three pictures

@@ -1,4 +1,4 @@
-"""Fewer splats, without training pictures.
+"""Reduce a field to fewer splats, without training pictures.
 
 With cameras the splats that contribute least are left out and the others are fitted to the full
 field's own renders (``rfcore.train.levels``). Without any, opacity and area decide, and all

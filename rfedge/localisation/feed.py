@@ -28,7 +28,7 @@ __all__ = ["RecordedFeed", "typical_start"]
 class RecordedFeed:
     """A feed read from a file, whose times are those of the drive plus an offset.
 
-    ``problems``: what was wrong with it, and how often.
+    ``problems`` counts what was wrong with it.
     """
 
     def __init__(self, offset_s: float) -> None:
@@ -50,7 +50,7 @@ class RecordedFeed:
 
     @property
     def fixes(self) -> int:
-        """How many fixes are used."""
+        """Number of fixes that are used."""
         return self._feed.count
 
     def priors(

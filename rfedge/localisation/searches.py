@@ -1,4 +1,4 @@
-"""How well the poses of a drive are found again: the searches of ``rfedge localise``.
+"""Searches of ``rfedge localise``, which measure how well the poses of a drive are found again.
 
 A search starts at the dataset's pose of a picture, displaced by a fixed distance, mostly
 horizontally, and turned by a fixed angle, mostly in yaw; or at the pose that a recorded feed states
@@ -51,7 +51,7 @@ NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True)
 class StartError:
-    """How far from the dataset's pose a search starts; also the prior's standard deviations."""
+    """Distance of a search's start from the dataset's pose; also the prior's deviations."""
 
     position_m: float
     rotation_deg: float
@@ -59,10 +59,10 @@ class StartError:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """One search: its picture, its start, what came back, and the errors of the pose if one did.
+    """One search: its picture and start, the answer, and the errors of the pose if there is one.
 
-    ``right``: the pose is the picture's, to the tolerance of this module. ``cpu_ms``: processor
-    time of this process.
+    A ``right`` pose is the picture's, to the tolerance of this module. ``cpu_ms`` is processor time
+    of this process.
     """
 
     picture: PosedPicture

@@ -14,9 +14,9 @@ import pytest
 from rfcore.dataset import read_dataset
 from rfcore.dataset.mounts import RIG, mounts_named
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.datasets.carla import Recorder, RecordSettings
+from rfedge.datasets.carla import CarlaRecorder, CarlaRecordSettings
 
-SMALL = RecordSettings(stations=3, spacing_m=5.0, size_px=(32, 18), timeout_s=0.2)
+SMALL = CarlaRecordSettings(stations=3, spacing_m=5.0, size_px=(32, 18), timeout_s=0.2)
 
 
 class Waypoint:
@@ -127,7 +127,7 @@ class World:
 
 def test_a_recording_is_a_dataset_of_all_cameras_both_ways(tmp_path: Path) -> None:
     world = World()
-    assert Recorder(carla, world, SMALL).record(tmp_path) == 2 * 3 * 18
+    assert CarlaRecorder(carla, world, SMALL).record(tmp_path) == 2 * 3 * 18
     dataset = read_dataset(tmp_path)
     assert len(dataset.pictures) == 108
     assert (dataset.pictures[0].read() == (3, 2, 1)).all(), "BGRA becomes RGB"
@@ -137,7 +137,7 @@ def test_a_recording_is_a_dataset_of_all_cameras_both_ways(tmp_path: Path) -> No
 
 def test_every_camera_looks_where_its_mount_says(tmp_path: Path) -> None:
     """The car drives along x at y = 0 and back at CARLA's y = -4, which is our +4."""
-    Recorder(carla, World(), SMALL).record(tmp_path)
+    CarlaRecorder(carla, World(), SMALL).record(tmp_path)
     found = {picture.name: picture.camera for picture in read_dataset(tmp_path).pictures}
     front = found["images/0001_mid_front.png"].world_from_cam
     assert front.translation_m == pytest.approx((15 + 2.5, 0, 2.8), abs=1e-5)
@@ -154,14 +154,14 @@ def test_every_camera_looks_where_its_mount_says(tmp_path: Path) -> None:
 def test_the_world_is_left_as_it_was(tmp_path: Path) -> None:
     world = World(mute=True)
     with pytest.raises(RfedgeError, match=r"no image of frame 9 within 0\.2 s"):
-        Recorder(carla, world, SMALL).record(tmp_path)
+        CarlaRecorder(carla, world, SMALL).record(tmp_path)
     assert (world.alive, world.hidden, world.sensors) == (0, set(), [])
     assert not world.settings.synchronous_mode
 
 
 def test_a_lane_that_ends_is_said(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="ends after 2"):
-        Recorder(carla, World(lane_end=16.0), SMALL).record(tmp_path)
+        CarlaRecorder(carla, World(lane_end=16.0), SMALL).record(tmp_path)
 
 
 def test_the_rig_has_18_cameras_in_three_rows() -> None:
