@@ -26,7 +26,7 @@ MAX_SIDE_PX = 8192
 """Longest picture side accepted anywhere."""
 
 UNIT_TOLERANCE = 1e-6
-"""How far a quaternion's norm may be from 1 before it is refused rather than normalised."""
+"""A quaternion is normalised if its norm is this close to 1, and refused otherwise."""
 
 Vec3 = tuple[float, float, float]
 Mat3 = tuple[Vec3, Vec3, Vec3]
@@ -121,10 +121,10 @@ class Pose:
         return Pose(t, _quaternion_from_rotation(m))
 
     def rounded(self) -> Pose:
-        """Return the pose in numbers that float32 has, for half the bytes on the wire.
+        """Return the pose rounded to float32 numbers, which take half the bytes on the wire.
 
-        Within 1 km of the tile's origin it moves by at most 0.031 mm along an axis and turns by
-        at most 1.2e-7 rad. Raises ``InvalidInput`` for metres beyond float32.
+        Within 1 km of the tile's origin this moves it by at most 0.031 mm along an axis and turns
+        it by at most 1.2e-7 rad. Raises ``InvalidInput`` for metres beyond float32.
         """
         x, y, z = array("f", self.translation_m)
         a, b, c, d = array("f", self.rotation)
@@ -172,7 +172,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class TileOrigin:
-    """Where a tile's local frame sits in a global metric frame (UTM or ECEF magnitudes)."""
+    """The origin of a tile's local frame in a global metric frame (UTM or ECEF magnitudes)."""
 
     east_m: float = 0.0
     north_m: float = 0.0
@@ -205,13 +205,13 @@ class Camera:
     world_from_cam: Pose
 
     def cam_from_world(self) -> Pose:
-        """Return the extrinsics the renderer uses."""
+        """Return the extrinsics of the renderer."""
         return self.world_from_cam.inverse()
 
     def rounded(self) -> Camera:
-        """Return the camera at its pose as it is sent (``Pose.rounded``).
+        """Return the camera at the pose that is sent (``Pose.rounded``).
 
-        Whoever sends a pose renders at the rounded one, so that both ends render at the same.
+        A sender renders at the rounded pose, so that both ends render at the same one.
         """
         return Camera(self.intrinsics, self.world_from_cam.rounded())
 

@@ -1,10 +1,10 @@
-"""Where a street is on the Earth: WGS 84 and a field's own axes.
+"""Georeferencing: places a field on the Earth, between WGS 84 and the field's own axes.
 
-An anchor states what one point of a world is on the ellipsoid of WGS 84, and how the world's axes
-lie to east, north, up there. Positions in between follow from the tangent plane at the anchor
-(local Cartesian ENU by ECEF, float64), which ``pymap3d`` computes; it comes with the extra
-``localise`` and is imported on first use. Latitude and longitude in degrees, heights in metres
-above the ellipsoid: NMEA states them above mean sea level and adds the geoid's separation.
+An anchor states the coordinates of one point of a world on the WGS 84 ellipsoid, and the rotation
+from the world's axes to east, north, up there. Positions in between follow from the tangent plane
+at the anchor (local Cartesian ENU by ECEF, float64), which ``pymap3d`` computes; it comes with the
+extra ``localise`` and is imported on first use. Latitude and longitude in degrees, heights in
+metres above the ellipsoid: NMEA states them above mean sea level and adds the geoid's separation.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Pictures in memory and in files.
 
-Two forms: RGB, uint8 [H, W, 3], as cameras and files have it; and ``I420``, 8-bit YUV 4:2:0 with
-BT.709 coefficients and limited range, as the codec has it. The exact conversion between them is
+There are two forms: RGB, uint8 [H, W, 3], of cameras and files; and ``I420``, 8-bit YUV 4:2:0 with
+BT.709 coefficients and limited range, of the codec. The exact conversion between them is
 ``rfcore.native.yuv``. Files are read and written with PyAV, so that the services need no OpenCV.
 """
 
@@ -41,7 +41,7 @@ Plane = NDArray[np.uint8]
 EXACT_CONVERSION = (
     Interpolation.BILINEAR | Interpolation.FULL_CHR_H_INT | Interpolation.ACCURATE_RND
 )
-"""swscale's short cuts darken a JPEG's green by 0.9 levels on average; so converted it is 0.02."""
+"""swscale's faster modes darken a JPEG's green by 0.9 levels on average, this one by 0.02."""
 
 
 UNSPECIFIED_MATRIX = 2
@@ -120,7 +120,7 @@ class I420:
 
     @staticmethod
     def unpacked(size_px: tuple[int, int], data: bytes) -> I420:
-        """Return the picture of (width, height) that ``packed`` gave.
+        """Return the picture of (width, height) whose ``packed`` form is ``data``.
 
         Raises ``InvalidInput`` for another number of bytes.
         """
@@ -142,7 +142,7 @@ class I420:
         return state.digest()
 
     def digest_head(self) -> bytes:
-        """Return what goes before the planes in the digest: the size."""
+        """Return the start of the digest's input, which states the size."""
         return f"{self.size_px}".encode()
 
 
@@ -153,7 +153,7 @@ def _half(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 MAX_PICTURE_PX = 1 << 26
-"""What a picture file may hold: 8192x8192, 200 MB decoded."""
+"""Most pixels of a picture file: 8192x8192, 200 MB decoded."""
 
 
 def read_rgb(path: Path) -> Rgb:
@@ -187,7 +187,8 @@ def _check_pixels(source: str, stream: av.VideoStream) -> None:
 
 
 def rgb_from_video_frame(frame: av.VideoFrame) -> Rgb:
-    """Return uint8 [H, W, 3]; a matrix that is not stated is taken as players take it."""
+    """Return uint8 [H, W, 3]; an unspecified colour matrix is guessed by the size, as players
+    do."""
     matrix = frame.colorspace
     if matrix == UNSPECIFIED_MATRIX:
         matrix = Colorspace.ITU709 if frame.height >= HD_LINES else Colorspace.ITU601

@@ -1,4 +1,4 @@
-"""Lens distortion: from the pinhole's direction to the place on the sensor, forth and back.
+"""Lens distortion: maps pinhole directions to positions on the sensor and back.
 
 Coordinates are normalised: (x, y) = (X / Z, Y / Z) in camera axes, so that a pinhole's pixel is
 ``(fx x + cx, fy y + cy)``. ``distort`` maps the direction of a point to where the lens puts it,
@@ -34,7 +34,7 @@ RESIDUAL = 1e-12
 
 
 class Lens(Protocol):
-    """What a lens does to normalised coordinates [N, 2], float64; a value, so hashable."""
+    """A distortion of normalised coordinates [N, 2], float64; a hashable value."""
 
     def __hash__(self) -> int: ...
 
@@ -71,7 +71,7 @@ class BrownLens:
 
     @property
     def max_radius(self) -> float:
-        """Where r g(r) stops growing: the least positive root of its derivative."""
+        """The radius where r g(r) stops growing: the least positive root of its derivative."""
         return math.sqrt(_least_positive_root((1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3)))
 
     def distort(self, xy: F64) -> F64:

@@ -1,4 +1,4 @@
-"""Rotations as vectors, and poses between poses: the one exponential, logarithm and SLERP.
+"""Rotation vectors (exponential and logarithm of SO(3)) and interpolation of poses (SLERP).
 
 A rotation vector points along the axis and is as long as the angle, in radians (the logarithm of
 SO(3)); quaternions are w, x, y, z as in ``rfcore.camera``. Angles lie in 0..pi: of q and -q, the
@@ -7,7 +7,7 @@ Rotations Using the Exponential Map", J. Graphics Tools 3(3), 1998; Shoemake, "A
 with Quaternion Curves", SIGGRAPH 1985.
 
 Unlike ``rfcore.camera`` this uses the C library's sine and arc tangent, whose last bit may differ
-between machines: send the pose that came out, not what it was computed from.
+between machines: send the resulting pose, not its inputs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rfcore.errors import InvalidInput
 __all__ = ["interpolated", "quaternion_from_vector", "rotation_vector"]
 
 TINY_RAD = 1e-150
-"""Under this the sine of an angle is the angle, and its quotient by it might underflow."""
+"""Below this angle its sine equals it, and their quotient might underflow."""
 
 Quaternion = tuple[float, float, float, float]
 

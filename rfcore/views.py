@@ -1,9 +1,9 @@
 """Rendered views of a radiance field, posed pictures, and points of the scene.
 
 Readers of datasets produce posed pictures, trainers consume them. Renderers produce a ``View``;
-both ends of the codec hold it as a ``FieldView``.
+both ends of the codec use it in the form of a ``FieldView``.
 
-Confidence, how far a rendered pixel can be trusted, follows from depth and opacity alone:
+Confidence says how far a rendered pixel can be trusted. It follows from depth and opacity alone:
 ``confidence = opacity * (1 - min(bend / BEND_LIMIT, 1))``. ``opacity`` is clipped to 0..1: where
 rays pass through, the field has no surface. ``bend`` is how far inverse depth w = 1 / z departs
 from a plane,
@@ -17,8 +17,8 @@ along an axis of one or two pixels nothing bends.
 Only float32 subtraction, multiplication, division, minimum and maximum, each rounded once as
 IEEE 754 prescribes: the same bytes on every machine.
 
-A device that drew a view may hold its depth and opacity: a ``HeldFieldView`` has them come to the
-CPU when somebody asks, and until then says where they are.
+A device that rendered a view may keep its depth and opacity. A ``HeldFieldView`` copies them to the
+CPU at the first request, and until then refers to the device's memory.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ Measured on the held-out drive of the first sample (27.1 dB): the error of pixel
 below 0.001 / 0.25 / 0.5 / 0.75 / 0.9 / above is 0.082 / 0.065 / 0.062 / 0.061 / 0.048 / 0.032 RMS.
 """
 NOTHING_M = np.float32(1e-6)
-"""A depth of nothing hit, or one whose inverse would overflow; no renderer draws so near."""
+"""Depths up to this mean that nothing was hit; no renderer draws so near."""
 F32 = NDArray[np.float32]
 
 
@@ -87,8 +87,8 @@ class View:
     ``colour`` float32 [H, W, 3], display-referred RGB, nominally 0..1 (not clamped);
     ``depth`` float32 [H, W], alpha-weighted mean z of surfaces in metres, 0 where nothing was hit,
     10 km where more is sky; ``opacity`` float32 [H, W], 0..1, the share of what has that depth;
-    ``confidence`` float32 [H, W], 0..1, how far the renderer itself trusts a pixel
-    (``rfcore.views``), computed when first asked for.
+    ``confidence`` float32 [H, W], 0..1, how far a pixel can be trusted (see the module), computed
+    at the first request.
     """
 
     colour: NDArray[np.float32]
@@ -97,17 +97,17 @@ class View:
 
     @cached_property
     def confidence(self) -> NDArray[np.float32]:
-        """Opacity, less where depth breaks."""
+        """Opacity, reduced where depth is discontinuous."""
         return confidence(self.depth, self.opacity)
 
 
 @dataclass(frozen=True, eq=False)
 class FieldView:
-    """What a radiance field shows at a camera, as both ends of the codec hold it.
+    """A radiance field's view at a camera, in the form that both ends of the codec use.
 
     ``render``: the colours as a codec picture. ``depth``: float32 [H, W], z in metres, 0 where
-    nothing was hit. ``opacity``: float32 [H, W], or ``None`` where it was dropped because nobody
-    will ask for it. Raises ``InvalidInput`` for a render, depth or opacity that is not
+    nothing was hit. ``opacity``: float32 [H, W], or ``None`` if it was dropped because it is not
+    needed any more. Raises ``InvalidInput`` for a render, depth or opacity that is not
     of the camera's size, an array that is not float32, or a depth that is not finite.
     """
 
@@ -132,7 +132,7 @@ class FieldView:
 
     @staticmethod
     def nothing(intrinsics: Intrinsics) -> FieldView:
-        """Return what a camera that is lost is given: grey, no depth, opaque nowhere."""
+        """Return the view of a camera whose pose is unknown: grey, without depth and opacity."""
         shape = (intrinsics.height_px, intrinsics.width_px)
         nowhere = np.zeros(shape, np.float32)
         grey = I420.filled(shape[::-1])
@@ -140,51 +140,52 @@ class FieldView:
 
     @property
     def held_depth(self) -> HeldPlane | None:
-        """What holds the depth, where that is a device."""
+        """The device's plane of depth, if a device holds it."""
         return None
 
     def under(self, render: I420) -> FieldView:
-        """Return the view with ``render``, its own under another light."""
+        """Return the view with ``render``, its own render under another light."""
         return replace(self, render=render)
 
     def without_opacity(self) -> FieldView:
-        """Return the view for those that will not ask for opacity."""
+        """Return the view without opacity, for users that do not need it."""
         return replace(self, opacity=None)
 
     @property
     def confidence(self) -> F32:
-        """Opacity, less where depth breaks; raises ``InvalidInput`` where opacity was dropped."""
+        """Opacity, reduced where depth is discontinuous; raises as ``kept_opacity``."""
         return confidence(self.depth, self.kept_opacity)
 
     def covers(self, least_opacity: float) -> NDArray[np.bool_]:
-        """Return where opacity is above ``least_opacity``; raises as ``confidence`` does."""
+        """Return where opacity is above ``least_opacity``; raises as ``kept_opacity``."""
         return self.kept_opacity > least_opacity
 
     @property
     def kept_opacity(self) -> F32:
-        """Opacity; raises ``InvalidInput`` where it was dropped."""
+        """Opacity; raises ``InvalidInput`` if it was dropped."""
         if self.opacity is None:
             raise InvalidInput("opacity", "was dropped from this view; render it again")
         return self.opacity
 
 
 class HeldPlane(Protocol):
-    """Depth or opacity of a view, float32 [H, W], where it was drawn. Depth is finite there."""
+    """Depth or opacity of a view, float32 [H, W], in a device's memory. Depth is finite."""
 
     def array(self) -> F32:
-        """Return it, from any thread."""
+        """Return the plane on the CPU; any thread may call this."""
 
     def carry(
         self, previous: I420, minus: I420 | None, before: FieldView, now: FieldView
     ) -> I420 | None:
-        """Return what ``warp_i420`` or, with ``minus``, ``correct_i420`` (``rfcore.native.warp``)
-        make, this being the depth of ``now``; ``None``: that is left to the CPU."""
+        """Return the result of ``warp_i420`` or, with ``minus``, of ``correct_i420``
+        (``rfcore.native.warp``), with this plane as the depth of ``now``; ``None`` if the CPU has
+        to compute it."""
 
 
 class HeldFieldView(FieldView):
-    """A view whose depth and opacity are held elsewhere, and come when they are first asked for.
+    """A view whose depth and opacity are in a device's memory until the first request.
 
-    Made by ``of``. What ``dataclasses.replace`` makes of one is a view like any other.
+    It is made by ``of``. ``dataclasses.replace`` turns it into an ordinary ``FieldView``.
     """
 
     _depth: HeldPlane | None = None
@@ -212,17 +213,17 @@ class HeldFieldView(FieldView):
 
     @property
     def held_depth(self) -> HeldPlane | None:
-        """What holds the depth."""
+        """The device's plane of depth."""
         return self._depth
 
     def under(self, render: I420) -> FieldView:
-        """Return the view with ``render``, its own under another light."""
+        """Return the view with ``render``, its own render under another light."""
         if self._depth is None:
             return super().under(render)
         return HeldFieldView.of(self.camera, render, self._depth, self._opacity)
 
     def without_opacity(self) -> FieldView:
-        """Return the view for those that will not ask for opacity."""
+        """Return the view without opacity, for users that do not need it."""
         if self._depth is None:
             return super().without_opacity()
         return HeldFieldView.of(self.camera, self.render, self._depth, None)
@@ -230,7 +231,7 @@ class HeldFieldView(FieldView):
 
 @dataclass(frozen=True)
 class PosedPicture:
-    """A picture with the camera that took it; pixels are read only when asked for.
+    """A picture with the camera that took it; its pixels are read on request.
 
     ``read`` returns uint8 [H, W, 3] RGB of exactly the camera's size.
     """

@@ -57,10 +57,10 @@ PREFIX_BYTES = PREFIX.size
 ALIGN_BYTES = 64
 MAX_HEADER_BYTES = 1 << 20
 HEAD_BYTES = PREFIX.size + MAX_HEADER_BYTES
-"""What ``check_length`` needs of a file."""
+"""``check_length`` needs at most this many bytes of a file."""
 MAX_DIMENSIONS = 4
 MAX_EMPTY_SIZE = 1 << 40
-"""Product of an empty array's other sides: numpy refuses shapes beyond 2^63."""
+"""Largest product of an empty array's other sides: numpy refuses shapes beyond 2^63."""
 RAISE_LIMIT = "if you trust the file, raise it (--max-field-gb; RFEDGE_MAX_FIELD_GB for rfedge)"
 DTYPES = ("<f4", "<f2", "<f8", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8")
 
@@ -69,7 +69,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Archive:
-    """What a field file holds: its kind ("splats"), JSON metadata, and arrays by name."""
+    """The content of a field file: its kind ("splats"), JSON metadata, and arrays by name."""
 
     kind: str
     metadata: Mapping[str, Any]
@@ -92,11 +92,11 @@ def encode_archive(archive: Archive) -> bytes:
 
 
 def decode_archive(data: bytes, source: str = "field", *, whole: bool = True) -> Archive:
-    """Return the content of a field file, or of its beginning: unless it must be ``whole``, arrays
-    that are not all there are left out.
+    """Return the content of a field file.
 
-    The arrays are read-only views of ``data``. Raises ``FieldFormatError``, naming ``source`` and
-    what is wrong, for anything ``encode_archive`` would not have written.
+    Unless it must be ``whole``, ``data`` may be the file's beginning; incomplete arrays are left
+    out. The arrays are read-only views of ``data``. Raises ``FieldFormatError``, naming ``source``
+    and what is wrong, for anything ``encode_archive`` would not have written.
     """
     try:
         return _decode(memoryview(data), whole)
@@ -105,8 +105,10 @@ def decode_archive(data: bytes, source: str = "field", *, whole: bool = True) ->
 
 
 def header_end(start: bytes) -> int:
-    """Return where the arrays begin in a field file, of which ``start`` are the first
-    ``PREFIX_BYTES``; raise ``FieldFormatError`` for another file."""
+    """Return the offset of the arrays in a field file that begins with ``start``.
+
+    ``start``: its first ``PREFIX_BYTES``. Raises ``FieldFormatError`` for another file.
+    """
     try:
         return _aligned(PREFIX.size + _prefix(start)[0])
     except _Damage as damage:
@@ -114,8 +116,10 @@ def header_end(start: bytes) -> int:
 
 
 def array_ends(head: bytes) -> Mapping[str, int]:
-    """Return up to where each array needs the file, by its name; ``head`` is all before the arrays,
-    as ``header_end`` has it. Raises ``FieldFormatError`` if it is damaged."""
+    """Return the offset at which each array of a field file ends, by its name.
+
+    ``head``: the file up to ``header_end``. Raises ``FieldFormatError`` if it is damaged.
+    """
     try:
         raw = _header_bytes(memoryview(head))
         entries, ends, end = _header(raw).get("arrays"), {}, _aligned(PREFIX.size + len(raw))
@@ -146,8 +150,9 @@ def check_length(head: bytes, size_bytes: int) -> None:
 def read_file(path: Path, max_bytes: int = DECODED_BYTES) -> bytes:
     """Return the bytes of a file that may hold a field of ``max_bytes`` of memory.
 
-    No archive is longer than its field, but for its header. Raises ``FieldFormatError`` for one
-    that is, or is no file, before any of it is read, and for one that cannot be read.
+    An archive without its header is no longer than its field. Raises ``FieldFormatError`` for a
+    longer file, or one that is no regular file, before any of it is read, and for one that cannot
+    be read.
     """
     try:
         with open_at_once(path) as file:
@@ -175,7 +180,7 @@ def check_array_bytes(archive: Archive, taken_bytes: int, max_bytes: int) -> Non
 
 
 class _Damage(Exception):
-    """What is wrong with a file; becomes a ``FieldFormatError`` that also names the file."""
+    """A fault of a file; becomes a ``FieldFormatError`` that also names the file."""
 
 
 def _decode(data: memoryview, whole: bool) -> Archive:
@@ -244,7 +249,7 @@ def _arrays(data: memoryview, entries: list[Any], whole: bool) -> dict[str, Arra
 
 
 def _end_of(entry: Any, offset: int) -> int:
-    """Return where the array that starts at ``offset`` ends, with the zeros behind it."""
+    """Return where the array that starts at ``offset`` ends, padding included."""
     _, dtype, shape = _described(entry)
     return _aligned(offset + math.prod(shape) * dtype.itemsize)
 

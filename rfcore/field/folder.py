@@ -1,10 +1,9 @@
-"""Which field archives lie in a folder: regular files ``*.rff``, by the SHA-256 of their content.
+"""Lists the field archives of a folder: regular files ``*.rff``, by the SHA-256 of their content.
 
-A file named ``<field id>.rff`` is listed by its name, any other by its digest. Each is looked at
-again only when its time, size or inode changes. What cannot be an archive (a folder, a pipe, a link
-to nowhere, a file without the archive's first bytes, too large, or of another length than its
-header says) is skipped and named, and hangs or fails nobody. Contents are checked when a field is
-loaded.
+A file named ``<field id>.rff`` is listed by its name, any other by its digest. A file is examined
+again only when its time, size or inode changes. Entries that cannot be archives (a folder, a pipe,
+a dangling link, a file with other first bytes, too large, or of another length than its header
+says) are skipped and reported; they block nothing. Contents are checked when a field is loaded.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ __all__ = ["FIELD_ID", "MAX_ARCHIVE_BYTES", "SUFFIX", "FieldFolder", "FolderList
 
 SUFFIX = ".rff"
 FIELD_ID = re.compile(r"[0-9a-f]{64}")
-"""What a field id looks like: the hexadecimal digits of a SHA-256."""
+"""A field id: the hexadecimal digits of a SHA-256."""
 
 MAX_ARCHIVE_BYTES = 4 << 30
-"""Longest archive that is listed; vehicles take no longer one."""
+"""Longest archive that is listed, and that vehicles accept."""
 
 Stamp = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
 class FolderListing:
-    """``paths`` of the archives by field id, and why other entries were ``skipped``."""
+    """``paths`` of the archives by field id, and the reasons why other entries were ``skipped``."""
 
     paths: Mapping[str, Path]
     skipped: Mapping[Path, str]
@@ -43,7 +42,7 @@ class FolderListing:
 
 @dataclass(frozen=True)
 class _Entry:
-    """What is known of a file with this stamp: its field id, or why it is skipped."""
+    """A file with this stamp has this field id, or is skipped because of ``problem``."""
 
     stamp: Stamp
     field_id: str = ""
@@ -59,10 +58,10 @@ class FieldFolder:
         self._seen: dict[Path, Stamp] = {}
 
     def look(self, *, settled: bool = False) -> FolderListing:
-        """Return what is there now.
+        """Return the present archives.
 
-        ``settled``: leave files out until two looks have found them the same, for one that is
-        being copied has a digest nobody wants.
+        ``settled``: leave out files that have changed since the last look, because they may still
+        be being copied.
         """
         paths: dict[str, Path] = {}
         skipped: dict[Path, str] = {}
@@ -79,7 +78,7 @@ class FieldFolder:
         return FolderListing(paths, skipped)
 
     def _entry(self, path: Path, before: Mapping[Path, Stamp] | None) -> _Entry | None:
-        """Return what is known of a file; None while it is not settled."""
+        """Return the entry of a file; None while it is not settled."""
         try:
             status = path.stat()
         except OSError as error:

@@ -1,17 +1,17 @@
-"""How much each splat matters, and each coefficient of its colour; the order archives store.
+"""The importance of each splat, which orders archives, and of each coefficient of its colour.
 
-With cameras: what a splat contributes, the sum over their pixels of transmittance times alpha.
-It is exactly the derivative of the picture's sum with respect to the splat's colour, so the
-trainer's backward pass counts it. Without cameras: opacity times the area it could cover, seen
-from the middle of the field; a guess, for fields that come without any.
+With cameras, a splat's importance is its contribution: the sum of transmittance times alpha over
+the pixels. That is the derivative of the picture's sum with respect to the splat's colour, so the
+trainer's backward pass computes it. Without cameras it is estimated as opacity times the area that
+the splat could cover as seen from the middle of the field.
 
 Measured on the first sample (150k splats, 27.1 dB), half / a quarter / a tenth of the splats, with
-no compensation: contributions 24.2 / 18.5 / 13.5 dB, the guess 23.2 / 16.9 / 11.8 dB, opacity times
-area alone 18.8 / 11.0 / 7.4 dB, random 17.7 / 12.6 / 9.4 dB.
+no compensation: contributions 24.2 / 18.5 / 13.5 dB, the estimate 23.2 / 16.9 / 11.8 dB, opacity
+times area alone 18.8 / 11.0 / 7.4 dB, random 17.7 / 12.6 / 9.4 dB.
 
-A splat is seen from few directions along a street, so that most of its 45 higher coefficients can
-be anything. ``frugal_colours`` chooses whole numbers that differ little where a splat is seen and
-take few bits: coordinate descent on ``e' G e`` + ``price`` x bits, with ``G`` the splat's matrix
+A splat is seen from few directions along a street, so most of its 45 higher coefficients hardly
+matter. ``frugal_colours`` chooses whole numbers that change little where a splat is seen and take
+few bits, by coordinate descent on ``e' G e`` + ``price`` x bits, with ``G`` the splat's matrix
 of ``seen_directions`` and bits by the frequencies of each coefficient's numbers. Measured on the
 sample street (300k splats, step 1/32): the higher coefficients take 0.90 MB instead of 3.8 at
 0.00 dB, 0.41 MB at -0.07 dB.
@@ -44,11 +44,11 @@ __all__ = [
 
 F64 = NDArray[np.float64]
 COMPONENT_WEIGHTS = (3.0, 0.5, 0.75)
-"""Squared error of red, green and blue for one of luma, orange and green of YCoCg-R."""
+"""Squared error of red, green and blue caused by one of luma, orange and green of YCoCg-R."""
 SWEEPS = 2
-"""A third changes 1 % of the numbers."""
+"""A third sweep changes only 1 % of the numbers."""
 MOST = 40
-"""Magnitudes from here on are counted as one."""
+"""Larger magnitudes are counted together with this one."""
 
 
 def contributions(
@@ -75,7 +75,7 @@ def seen_directions(
     threads: int = 1,
     antialiased: bool = False,
 ) -> F32:
-    """Return, for each splat, how errors of its K coefficients show together, float32 [N, K, K].
+    """Return for each splat how errors of its K coefficients show together, float32 [N, K, K].
 
     The sum over ``cameras`` of the splat's blending weight times ``b b'``, with ``b`` its spherical
     harmonics in the camera's direction: 1 kB a splat of degree 3. Raises ``InvalidInput`` when
@@ -128,7 +128,7 @@ class _ColourSearch:
         self._sizes[0] = 2.0**-steps.sh_dc
 
     def set_error(self, error: F32) -> None:
-        """Take what is missing of the colours, float32 [N, K, 3] red, green, blue."""
+        """Set the present error of the colours, float32 [N, K, 3] red, green, blue."""
         red, green, blue = error[..., 0], error[..., 1], error[..., 2]
         orange = red - blue
         middle = blue + orange / 2
@@ -136,7 +136,7 @@ class _ColourSearch:
         self._pull = [_product(self._seen, part.astype(np.float32)) for part in parts]
 
     def sweep(self) -> None:
-        """Choose every number anew, the highest band first, so that the constant one comes last."""
+        """Choose every number anew, from the highest band to the constant one."""
         for component, weight in enumerate(COMPONENT_WEIGHTS):
             for k in reversed(range(len(self._sizes))):
                 self._choose(component, k, weight)
@@ -170,9 +170,9 @@ def _product(matrices: F32, vectors: F32) -> F32:
 
 
 def _bits_of(column: Integers) -> F32:
-    """Return the bits [MOST + 1] of a number by its magnitude, as frequent as in ``column``.
+    """Return the bits [MOST + 1] of a number by its magnitude, from the frequencies in ``column``.
 
-    In sixteenths, so that machines whose logarithms differ in the last place choose alike.
+    They are rounded to sixteenths, so that machines with slightly different logarithms agree.
     """
     counts = np.bincount(_magnitude(column), minlength=MOST + 1) + 0.5
     bits = np.log2(counts.sum() / counts) + (np.arange(MOST + 1) > 0)
@@ -225,6 +225,6 @@ def most_important_first(importance: F64) -> NDArray[np.intp]:
 
 
 def reordered(gaussians: Gaussians, order: NDArray[np.intp]) -> Gaussians:
-    """Return the Gaussians of ``order`` [K], which may leave some out."""
+    """Return the Gaussians with the indices ``order`` [K], which may leave some out."""
     arrays = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
     return Gaussians(**{name: np.ascontiguousarray(a[order]) for name, a in arrays.items()})

@@ -41,7 +41,7 @@ FILTERS = (
         "pb": 0,
     },
 )
-"""The high bits of the byte before are the only context that told anything, 1 % in all."""
+"""The high bits of the byte before are the only context that helps; they save 1 %."""
 
 MAX_INFLATION = 1000
 """Decoded bytes for each coded one, beyond which a stream is refused as a bomb."""
@@ -53,9 +53,9 @@ Integers = NDArray[np.int32]
 
 
 def encode_columns(values: Integers) -> tuple[dict[str, list[int]], NDArray[np.uint8]]:
-    """Return what a header says of ``values`` int32 [N, C], and their stream.
+    """Return the header of ``values`` int32 [N, C], and their stream.
 
-    The former is {"lowest": [...], "bytes": [...]} with one number a column. Raises
+    The header is {"lowest": [...], "bytes": [...]} with one number a column. Raises
     ``InvalidInput`` for values so alike that a reader would take the stream for a bomb.
     """
     lowest = values.min(axis=0) if len(values) else np.zeros(values.shape[1], np.int32)
@@ -88,7 +88,7 @@ def decode_columns(
 
 @dataclass(frozen=True)
 class Columns:
-    """A decoded stream, of which rows are made when they are asked for.
+    """A decoded stream, from which rows are made on request.
 
     ``planes`` uint8 [sum of ``widths``, N]: the bytes of the columns, lowest first.
     """

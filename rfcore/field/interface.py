@@ -1,10 +1,10 @@
-"""What every radiance field is to those who use one, whatever it is made of.
+"""The interface of every kind of radiance field.
 
-A field is immutable, may be shared between threads, and is named by its id, the SHA-256 of its
+A field is immutable, may be shared between threads, and is identified by the SHA-256 of its
 archive. The same field, camera and quality give the same bytes on every machine.
 
-A field's metadata lies in the JSON header of its archive, readable without its arrays.
-``bounds`` stands beside the values of ``FieldMetadata``; ``kind`` is the archive's own.
+A field's metadata is in the JSON header of its archive, which can be read without its arrays.
+``bounds`` is stored beside the values of ``FieldMetadata``; ``kind`` is the archive's own.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ NGP = "ngp"
 """Multiresolution hash grid with a small network (Mueller et al. 2022)."""
 KINDS = (SPLATS, NGP)
 LAYER, DELTA = "layer", "delta"
-"""Archives that are nothing without the splats of their base: ``rfcore.field.layer`` and
+"""Archives that need the splats of their base: ``rfcore.field.layer`` and
 ``rfcore.field.delta``."""
 Vec3 = tuple[float, float, float]
 
@@ -71,7 +71,8 @@ class Bounds:
 
     @staticmethod
     def around(points_m: NDArray[np.float32]) -> Bounds:
-        """Return the box of those of ``points_m`` [N, 3] that are not sky; of none, the origin."""
+        """Return the box around the ``points_m`` [N, 3] that are not sky; the origin if there are
+        none."""
         points_m = points_m[~sky_of(points_m)]
         if not len(points_m):
             return Bounds((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -81,13 +82,13 @@ class Bounds:
 
 @dataclass(frozen=True)
 class FieldMetadata:
-    """What is known about a field besides its parameters.
+    """Facts about a field besides its parameters.
 
     ``training_digest`` is the digest of the pictures, points and settings it was trained with,
-    empty when it was imported. ``held_out_psnr_db`` and ``held_out_ssim`` are means over pictures
-    it was not trained on, ``None`` when nobody measured. ``antialiased`` says how splats are to be
-    drawn: with the opacity that makes up for the screen-space blur, because they were trained so.
-    ``anchor`` says where on the Earth the field's own axes are, ``None`` where nobody stated it.
+    empty for an imported field. ``held_out_psnr_db`` and ``held_out_ssim`` are means over pictures
+    it was not trained on, ``None`` if they were not measured. ``antialiased``: the splats were
+    trained to be drawn with an opacity that compensates the screen-space blur. ``anchor``: where on
+    the Earth the field's axes are, ``None`` if that was not stated.
     """
 
     name: str = ""
@@ -112,7 +113,7 @@ class FieldMetadata:
 
 
 class Renderer(Protocol):
-    """The part of a radiance field that a codec's end needs."""
+    """The part of a radiance field that the codec needs."""
 
     def render(self, camera: Camera, quality: Quality) -> View:
         """Return colour, depth and opacity as ``camera`` sees them."""
@@ -120,23 +121,23 @@ class Renderer(Protocol):
 
 @runtime_checkable
 class CodecPictureRenderer(Protocol):
-    """A renderer that makes the codec's picture itself, sooner than from the colours."""
+    """A renderer that makes the codec's picture itself, faster than from the colours."""
 
     @property
     def is_on_device(self) -> bool:
-        """Whether a device draws, where depth and opacity of a ``field_view`` stay until somebody
-        asks for them, and the colours for good."""
+        """True if a device renders. Depth and opacity of a ``field_view`` stay there until somebody
+        asks for them; the colours are never copied."""
 
     def field_view(self, camera: Camera, quality: Quality) -> FieldView:
-        """Return what ``field_view_from_view`` makes of ``Renderer.render``."""
+        """Render, and return what ``field_view_from_view`` would make of it."""
 
 
 class RadianceField(Protocol):
-    """A radiance field with all that is known about it."""
+    """A radiance field that renders, with its metadata."""
 
     @property
     def metadata(self) -> FieldMetadata:
-        """What is known about the field."""
+        """Facts about the field besides its parameters."""
 
     @property
     def field_id(self) -> str:
@@ -144,42 +145,42 @@ class RadianceField(Protocol):
 
     @property
     def bounds(self) -> Bounds:
-        """The box the field was made for; what is drawn may reach beyond it."""
+        """The box that the field was made for; it may show things beyond it."""
 
     @property
     def primitives(self) -> int:
-        """How many Gaussians, or trained numbers of a hash grid, the field has."""
+        """The number of Gaussians, or of trained numbers of a hash grid."""
 
     @property
     def isa(self) -> str:
-        """The instruction set it renders with; it changes the time a picture takes, no byte."""
+        """The instruction set it renders with, which changes the time of a picture but no byte."""
 
     @property
     def most_detail(self) -> float:
-        """The highest ``Quality.detail`` that can be drawn: 1, unless only a beginning of the
-        archive is here."""
+        """The highest ``Quality.detail`` that can be drawn: 1, unless only a part of the archive
+        was loaded."""
 
     def prepare(self, quality: Quality = FULL) -> None:
-        """Make what rendering at ``quality`` needs, so that the first picture is not late."""
+        """Prepare rendering at ``quality``, so that the first picture is not slow."""
 
     def render(self, camera: Camera, quality: Quality = FULL) -> View:
         """Render colour, depth and opacity as ``camera`` sees them."""
 
     def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:
-        """Render colour alone, float32 [H, W, 3]: the bytes of ``render``'s, sooner."""
+        """Render only colour, float32 [H, W, 3]: the same bytes as ``render``, faster."""
 
     def archive(self) -> Archive:
-        """Return what the field's file holds."""
+        """Return the content of the field's file."""
 
     def with_threads(self, threads: int) -> RadianceField:
-        """Return the same field with a renderer of its own, of so many threads, which waits for no
-        other; the numbers are shared."""
+        """Return the same field with a renderer of its own and so many threads. The parameters are
+        shared; neither renderer waits for the other."""
 
 
 def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FULL) -> FieldView:
-    """Render what ``camera`` sees, as both ends of the codec hold it.
+    """Render what ``camera`` sees, in the form that both ends of the codec use.
 
-    A sender passes the camera it announces: ``Camera.rounded``.
+    A sender passes the camera that it sends: ``Camera.rounded``.
     """
     if isinstance(renderer, CodecPictureRenderer):
         return renderer.field_view(camera, quality)
@@ -192,7 +193,7 @@ def base_of(archive: Archive) -> str | None:
 
 
 def stored_metadata(metadata: FieldMetadata, bounds: Bounds) -> dict[str, Any]:
-    """Return what the header says of a field."""
+    """Return a field's metadata as its header stores it."""
     values = asdict(metadata)
     del values["kind"], values["anchor"]
     if metadata.anchor is not None:
@@ -225,7 +226,7 @@ def metadata_of_header(kind: str, stored: Mapping[str, Any]) -> FieldMetadata:
 
 
 def bounds_of_header(stored: Mapping[str, Any]) -> Bounds | None:
-    """Return the bounds a header states, ``None`` if it states none; raises as above."""
+    """Return the bounds in a header, or ``None``; raises as ``metadata_of_header``."""
     if "bounds" not in stored:
         return None
     return Bounds(_corner(stored["bounds"]["low_m"]), _corner(stored["bounds"]["high_m"]))

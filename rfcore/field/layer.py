@@ -1,8 +1,8 @@
 """A colour layer: the colours of a splat field under another light, in a tenth of its bytes.
 
-An archive of its own of kind ``layer``, good for one base field alone, whose id its header states.
-As that id is under the archive's digest, the SHA-256 of the layer names the field that base and
-layer make together, and both ends of a session mean the same one.
+It is an archive of kind ``layer`` for one base field, whose id its header states. Because that id
+is covered by the archive's digest, the SHA-256 of the layer identifies the field that base and
+layer make together.
 
 What is added to the constant colour of splat i, in Y, R - G and B - G::
 
@@ -13,8 +13,8 @@ whole numbers; higher bands of the colour are scaled by ``bands`` / 64. Only flo
 additions, multiplications and roundings, so that the same colours come out on every machine.
 
 Voxels are those that hold a mean of the base, in ascending order of x, y, z, so that they need no
-addresses. Numbers that are all 0 are not stored. Everything but the constant colour is the base's:
-shape, opacity, levels of detail.
+addresses. Streams that are all 0 are not stored. Shape, opacity and levels of detail are the
+base's.
 """
 
 from __future__ import annotations

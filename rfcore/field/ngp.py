@@ -1,15 +1,13 @@
 """A radiance field made of a multiresolution hash grid (Mueller et al. 2022).
 
-``Quality.samples_per_ray`` is its knob: ``None`` takes every occupied step along a ray, a number n
-merges neighbouring ones where a ray has more than n (``rfcore.ngp.reference.render_rays``). What
-its archive holds is in ``rfcore.field.ngp``.
+``Quality.samples_per_ray`` trades accuracy for time: ``None`` takes every occupied step along a
+ray, a number n merges neighbouring steps where a ray has more than n
+(``rfcore.ngp.reference.render_rays``).
 
-A hash grid as the content of an archive.
-
-Arrays: ``table`` float16 [entries, 2], ``matrices`` float32 [weights], and of the occupancy's bits
-the words that are not zero: ``occupancy_at`` uint32, ascending, and ``occupancy_words`` uint32.
-The header's ``ngp`` holds the shape: cells of every level (no formula to round differently
-somewhere), log2 of T, hidden width, the box and the steps along a ray.
+Arrays of its archive: ``table`` float16 [entries, 2], ``matrices`` float32 [weights], and of the
+occupancy's bits the words that are not zero: ``occupancy_at`` uint32, ascending, and
+``occupancy_words`` uint32. The header's ``ngp`` holds the shape: cells of every level (no formula
+to round differently somewhere), log2 of T, hidden width, the box and the steps along a ray.
 """
 
 from __future__ import annotations
@@ -46,8 +44,8 @@ FLOAT16_MAX = np.float32(np.finfo(np.float16).max)
 def as_stored(numbers: NgpParameters) -> NgpParameters:
     """Return what reading an archive of ``numbers`` gives: the table rounded to float16.
 
-    The file is half as long. Features are of the order of 0.1, so they move by at most 2**-14, and
-    quality is measured on what was stored.
+    That halves the file. Features are of the order of 0.1, so they change by at most 2**-14, and
+    quality is measured on the stored field.
     """
     table = np.clip(numbers.table, -FLOAT16_MAX, FLOAT16_MAX).astype(np.float16)
     return NgpParameters(
@@ -188,20 +186,20 @@ class NgpField:
 
     @property
     def primitives(self) -> int:
-        """How many trained numbers the field has."""
+        """The number of trained numbers."""
         return self.numbers.table.size + self.numbers.matrices.size
 
     @property
     def most_detail(self) -> float:
-        """1: a hash grid is drawn whole."""
+        """Always 1: a hash grid is drawn whole."""
         return 1.0
 
     def archive(self) -> Archive:
-        """Return what the field's file holds."""
+        """Return the content of the field's file."""
         return ngp_archive(self.numbers, self.metadata)
 
     def with_threads(self, threads: int) -> NgpField:
-        """Return the same field with a renderer of its own, of so many threads."""
+        """Return the same field with a renderer of its own and so many threads."""
         own = copy(self)
         own.isa, own._threads = check_backend(threads, self.isa), threads
         own._renderer, own._lock = None, Lock()
@@ -226,7 +224,7 @@ class NgpField:
         return self.renderer().render(camera, quality.samples_per_ray)
 
     def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:
-        """Render colour alone, float32 [H, W, 3]: the bytes of ``render``, sooner."""
+        """Render only colour, float32 [H, W, 3]: the same bytes as ``render``, faster."""
         return colour_at_scale(self._colour, camera, quality)
 
     def _colour(self, camera: Camera, quality: Quality) -> NDArray[np.float32]:

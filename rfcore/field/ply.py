@@ -59,8 +59,7 @@ F32 = NDArray[np.float32]
 def read_open_ply(
     path: Path, file: BinaryIO, tile_origin: TileOrigin | None, max_bytes: int
 ) -> Gaussians:
-    """Read Gaussians of SH degree 0..3; ``tile_origin`` is taken off the means in float64, ``path``
-    is the file's name.
+    """Read Gaussians of SH degree 0..3; ``tile_origin`` is subtracted from the means in float64.
 
     Raises ``FieldFormatError`` naming the file and the property or Gaussian at fault, and for
     Gaussians that take more than ``max_bytes`` of memory.
@@ -88,9 +87,9 @@ def read_open_ply(
 
 
 def antialiased_of(path: Path, comments: Sequence[str]) -> bool | None:
-    """Return how the comments of a header say that splats are drawn; ``None`` if they do not.
+    """Return whether the comments of a header say that splats are drawn antialiased, or ``None``.
 
-    Raises ``FieldFormatError`` when they name a mode there is not.
+    Raises ``FieldFormatError`` if they name an unknown mode.
     """
     stated = None
     for comment in comments:

@@ -51,7 +51,7 @@ DTYPES = {name: code for code, names in SPELLINGS.items() for name in names}
 
 @dataclass(frozen=True)
 class Header:
-    """What a header says: the format's name, the number of vertices, the dtype of a row."""
+    """The header of a file: the format's name, the number of vertices, the dtype of a row."""
 
     format: str
     count: int
@@ -135,9 +135,9 @@ def _row_dtype(path: Path, properties: list[list[str]], order: str) -> np.dtype[
 NAMES = {np.dtype("<f4"): "float", np.dtype("<f8"): "double", np.dtype("u1"): "uchar"}
 ROWS_AT_ONCE = 4096
 SHORTEST_VALUE_BYTES = 2
-"""A digit and what separates it from the next."""
+"""A digit and a separator."""
 LONGEST_VALUE_BYTES = 64
-"""On average over a row; a longer line is no row, and is not read to its end."""
+"""Longest value, on average over a row; a longer line is not read to its end."""
 Table = NDArray[np.void]
 
 

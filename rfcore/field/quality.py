@@ -1,13 +1,13 @@
-"""How much of a field is drawn: settings that trade accuracy for time, on both ends alike.
+"""Settings of rendering that trade accuracy for time, in the same way on both ends.
 
-A ``Quality`` is a value that both ends of a session can name; the same field, camera and quality
-give the same bytes everywhere. Each kind of field reads the settings it has and ignores the others.
+A ``Quality`` is sent with each frame; the same field, camera and quality give the same bytes
+everywhere. Each kind of field uses the settings that apply to it and ignores the others.
 
 Of N splats, the level ``detail`` draws the first ``ceil(detail * N)`` in the archive's order, so
-that every level of detail is a prefix of the next; the product is taken in whole numbers. Where the
-archive has scales and opacities of that level's own, they stand in place of the field's: fewer
-splats have to be wider and denser to leave no gaps (``rfcore.train.levels`` fits them; what that is
-worth is measured there). Nothing is computed: the same splats on every machine.
+that every level of detail is a prefix of the next; the product is taken in whole numbers. An
+archive may have scales and opacities for a level, which replace the field's: fewer splats have to
+be wider and denser to leave no gaps (``rfcore.train.levels`` fits them and has measurements).
+Nothing is computed: the same splats on every machine.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ DETAILS = (1.0, 0.5, 0.25, 0.1)
 """The shares of a field's splats that can be drawn. A fixed list, so that every level has one
 definition and a field keeps at most four sets."""
 SCALES = (1.0, 0.5)
-"""The sides a picture can be rendered at, of its own (``rfcore.field.scale``)."""
+"""Scales that a picture can be rendered at (``rfcore.field.scale``)."""
 MAX_SH_DEGREE = 3
 MAX_SAMPLES_PER_RAY = 4096
 
 
 @dataclass(frozen=True)
 class Quality:
-    """How a field is drawn; raises ``InvalidInput`` for what cannot be asked for."""
+    """How a field is drawn; raises ``InvalidInput`` for values out of range."""
 
     detail: float = 1.0
     """Share of the splats: 1, 0.5, 0.25 or 0.1, the most important ones first."""
@@ -83,9 +83,9 @@ FULL = Quality()
 
 @dataclass(frozen=True)
 class LevelOfDetail:
-    """What the K splats of one level of detail have in place of the field's own.
+    """Scales and opacities of the K splats of one level of detail, in place of the field's.
 
-    ``log_scales`` [K, 3] and ``opacity_logits`` [K] as in ``Gaussians``, float32.
+    ``log_scales`` [K, 3] and ``opacity_logits`` [K] are float32, as in ``Gaussians``.
     """
 
     log_scales: F32
@@ -94,7 +94,7 @@ class LevelOfDetail:
 
 @dataclass(frozen=True)
 class Beginning:
-    """What the first splats of a field are a part of: they are of ``count``, and draw levels up to
+    """A part of a field: its first splats, of ``count`` in all, which draw levels up to
     ``detail``."""
 
     count: int
@@ -102,7 +102,7 @@ class Beginning:
 
 
 LevelsOfDetail = Mapping[float, LevelOfDetail]
-"""By ``Quality.detail``; full detail has none, and neither need the others."""
+"""Levels by ``Quality.detail``; full detail has none, and others may be missing."""
 
 
 def kept_of(count: int, detail: float) -> int:
@@ -111,7 +111,7 @@ def kept_of(count: int, detail: float) -> int:
 
 
 def splats_in(gaussians: Gaussians, part: slice) -> Gaussians:
-    """Return some splats; nothing is copied."""
+    """Return a part of the splats without copying."""
     return Gaussians(**{f.name: getattr(gaussians, f.name)[part] for f in fields(Gaussians)})
 
 

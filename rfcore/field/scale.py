@@ -1,4 +1,4 @@
-"""A picture rendered at half its width and height, and enlarged: a quarter of the pixels to fill.
+"""Renders a picture at half its width and height and enlarges it, for a quarter of the pixels.
 
 Pixel centres are at +0.5, so a half-size pixel k covers pixels 2k and 2k + 1, and pixel i lies at
 (i + 0.5) / 2 in half-size coordinates: a quarter from one half-size centre and three quarters from
@@ -28,7 +28,7 @@ F32 = NDArray[np.float32]
 def view_at_scale(
     render: Callable[[Camera, Quality], View], camera: Camera, quality: Quality
 ) -> View:
-    """Return what ``render`` shows at ``quality.scale``, in the size of ``camera``."""
+    """Render at ``quality.scale``, and return the view in the size of ``camera``."""
     if quality.scale == 1:
         return render(camera, quality)
     small = render(_half(camera), replace(quality, scale=1.0))
@@ -44,7 +44,7 @@ def view_at_scale(
 def colour_at_scale(
     render: Callable[[Camera, Quality], F32], camera: Camera, quality: Quality
 ) -> F32:
-    """Return the colour of ``view_at_scale``, when colour is all that is rendered."""
+    """Return the colour of ``view_at_scale`` where ``render`` makes only colour."""
     if quality.scale == 1:
         return render(camera, quality)
     small = render(_half(camera), replace(quality, scale=1.0))

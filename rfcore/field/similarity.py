@@ -1,13 +1,12 @@
-"""Moving a field to another frame: turned, scaled, shifted.
+"""Moves a field to another frame by a rotation, a scale and a translation.
 
-``p_dst = scale * rotation @ p_src + translation_m``. Everything of a Gaussian follows: its mean,
-its widths, its rotation, and its colour, because spherical harmonics are functions of the
-direction in the field's frame. Done once, when a field is imported, in float64.
+``p_dst = scale * rotation @ p_src + translation_m``. Means, widths, rotations and colours of the
+Gaussians change; colours, because spherical harmonics are functions of the direction in the field's
+frame. It is done in float64, once, when a field is imported.
 
-``dataparser_transforms.json``: how nerfstudio normalised the scene a ``.ply`` was trained in.
-
-``{"transform": 3x4, "scale": s}`` with p_field = s * (transform @ (p_world, 1)). In the world,
-not in that frame, are the dataset's poses and everything else of ours.
+nerfstudio's ``dataparser_transforms.json`` says how it normalised the scene that a ``.ply`` was
+trained in: ``{"transform": 3x4, "scale": s}`` with p_field = s * (transform @ (p_world, 1)). The
+dataset's poses are in the world, not in that frame.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ __all__ = ["Similarity", "moved", "read_field_from_world", "spherical_harmonics"
 
 F64 = NDArray[np.float64]
 DIRECTIONS = 64
-"""Sample directions for the rotation of SH; 7 unknowns a row at most."""
+"""Sample directions for the rotation of SH, which has at most 7 unknowns a row."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Similarity:
 
 
 def moved(gaussians: Gaussians, dst_from_src: Similarity) -> Gaussians:
-    """Return the Gaussians in the frame dst: from there they look as they did from src."""
+    """Return the Gaussians expressed in the frame dst."""
     means = dst_from_src.apply(gaussians.means.astype(np.float64))
     widening = np.log(dst_from_src.scale)
     return replace(
@@ -101,9 +100,9 @@ def _turned(quaternions: F32, by: tuple[float, float, float, float]) -> F32:
 
 
 def _turned_sh(sh: F32, rotation: F64) -> F32:
-    """Return coefficients [N, K, 3] of the colours turned with the field.
+    """Return the coefficients [N, K, 3] of colours rotated with the field.
 
-    Each band is closed under rotation; its matrix is solved for from its values at directions.
+    Each band is closed under rotation; its matrix is solved from its values in many directions.
     """
     turned = sh.astype(np.float64)
     directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))

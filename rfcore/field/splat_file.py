@@ -1,4 +1,4 @@
-"""Files of splats from other programs, told apart by their names: ``.ply`` and ``.spz``."""
+"""Reads splat files of other programs, ``.ply`` and ``.spz``, chosen by their suffix."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ __all__ = ["SPLAT_SUFFIXES", "check_suffix", "read_open_splat_file", "read_splat
 
 SPLAT_SUFFIXES = (".ply", ".spz")
 CONVERTED = (".splat", ".ksplat", ".sog")
-"""Formats that keep fewer bits than .ply and that splat-transform converts."""
+"""Lossy formats that splat-transform converts."""
 OTHERS = (".gltf", ".glb")
 
 
 def read_splat_file(
     path: Path, tile_origin: TileOrigin | None = None, max_bytes: int = DECODED_BYTES
 ) -> tuple[Gaussians, bool | None]:
-    """Return the Gaussians, SH degree 0..3, ``tile_origin`` taken off the means in float64; and how
-    the file says that they are drawn: antialiased, not, or ``None`` where it does not say.
+    """Return the Gaussians of SH degree 0..3, with ``tile_origin`` subtracted from the means in
+    float64, and whether the file says that they are drawn antialiased (``None``: it does not say).
 
     Raises ``FieldFormatError`` naming the file and what is wrong with it, for a format that is not
     read, and for Gaussians that take more than ``max_bytes`` of memory.
@@ -41,7 +41,7 @@ def read_splat_file(
 def read_open_splat_file(
     path: Path, file: BinaryIO, tile_origin: TileOrigin | None, max_bytes: int
 ) -> tuple[Gaussians, bool | None]:
-    """Read an open file as ``read_splat_file`` does; ``path`` is its name."""
+    """Read an open file named ``path`` as ``read_splat_file`` does."""
     if path.suffix.lower() == ".spz":
         return read_open_spz(path, file, tile_origin, max_bytes)
     gaussians = read_open_ply(path, file, tile_origin, max_bytes)
@@ -50,7 +50,7 @@ def read_open_splat_file(
 
 
 def check_suffix(path: Path) -> None:
-    """Raise ``FieldFormatError`` for a format that is not read, naming what converts it."""
+    """Raise ``FieldFormatError`` for a format that is not read, naming a converter."""
     suffix = path.suffix.lower()
     if suffix in OTHERS:
         raise FieldFormatError(f"{path}: {suffix} is not read; export the splats as .ply")

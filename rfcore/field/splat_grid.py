@@ -1,8 +1,8 @@
-"""Splats on a grid: the whole numbers a compressed archive stores, and the splats they stand for.
+"""Splats on a grid: the integers that a compressed archive stores, and the splats they mean.
 
-Every step is a power of two and every number fits float32's 24 bits, so what is decoded is exact:
-the same bytes on every machine, without a rounding anywhere (the three small components of a
-rotation aside, a float32 division by 127 each).
+Every step is a power of two and every number fits float32's 24 bits, so decoding does not round and
+gives the same bytes on every machine. (The three small components of a rotation are a float32
+division by 127 each.)
 
 * means: blocks of 256 splats in file order; in a block, ``2^e`` times (base + q), with e chosen so
   that the step is at most an eighth of the block's smaller widths;
@@ -67,7 +67,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Grain:
-    """How finely a writer places splats; readers need not know, for the format has room for finer.
+    """How finely a writer places splats; readers need not know it.
 
     A step of means is at most ``2^-means_bits`` of the block's smaller widths; rotations are
     multiples of ``rotation`` of their steps.

@@ -1,7 +1,7 @@
 """A radiance field made of 3D Gaussians (Kerbl et al. 2023).
 
-What its archive holds is in ``rfcore.field.splat_archive``, which splats a quality draws in
-``rfcore.field.quality``.
+``rfcore.field.splat_archive`` describes its archive, ``rfcore.field.quality`` which splats are
+drawn at a quality.
 """
 
 from __future__ import annotations
@@ -41,13 +41,12 @@ __all__ = ["SplatField"]
 class SplatField:
     """Gaussians with metadata, ready to render.
 
-    ``levels`` is what the lower levels of detail have of their own (``rfcore.field.quality``).
-    ``archive`` is the one the field came from, ``None`` for one that was just made.
-    ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
-    ``isa`` may be an OpenCL device. ``beginning``: what ``gaussians`` are the first splats of
-    (``decode_beginning``); they are drawn as of the whole, up to ``most_detail``, and have no
-    archive. Raises ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between
-    threads.
+    ``levels``: scales and opacities of the lower levels of detail (``rfcore.field.quality``).
+    ``archive``: the archive that the field was read from, ``None`` for a new field. ``threads`` and
+    ``isa``, which may be an OpenCL device, change how fast it renders, but no byte. ``beginning``:
+    ``gaussians`` are only the first splats of a field (``decode_beginning``), which draw levels up
+    to ``most_detail`` and have no archive. Raises ``BackendUnavailable`` if this machine lacks
+    ``isa``. Safe to share between threads.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class SplatField:
         check_levels(gaussians, self.levels, self._beginning.count)
         self.isa = check_renderer(threads, isa)
         self.base: SplatField | None = None
-        """The field that this one's archive is a layer or a delta of, if it is one."""
+        """The base field, if this one's archive is a layer or a delta."""
         self._threads = threads
         self._archive = archive
         self._rasterizers: dict[float, Rasterizer] = {}
@@ -88,21 +87,22 @@ class SplatField:
 
     @property
     def primitives(self) -> int:
-        """How many Gaussians the field has."""
+        """The number of Gaussians."""
         return len(self.gaussians)
 
     @property
     def threads(self) -> int:
-        """How many threads render."""
+        """The number of threads that render."""
         return self._threads
 
     @property
     def most_detail(self) -> float:
-        """The highest level of detail that can be drawn: 1, unless only a beginning is here."""
+        """The highest level of detail that can be drawn: 1, unless only a part was loaded."""
         return self._beginning.detail
 
     def archive(self) -> Archive:
-        """Return what the field's file holds; raise ``InvalidInput`` if not all of it is here."""
+        """Return the content of the field's file; raise ``InvalidInput`` if only a part was
+        loaded."""
         if self.most_detail < 1:
             count = self._beginning.count
             raise InvalidInput("field", f"{len(self.gaussians)} of {count} splats are here")
@@ -111,9 +111,9 @@ class SplatField:
         return splat_archive(self.gaussians, self.levels, self.metadata)
 
     def compressed(self, steps: Steps | None = None, grain: Grain = FINEST) -> SplatField:
-        """Return the field that a compressed archive of this one holds; of such a one, itself.
+        """Return this field compressed; a compressed field returns itself.
 
-        It differs a little and is another field. Raises ``InvalidInput`` for values that a
+        The result differs slightly and is another field. Raises ``InvalidInput`` for values that a
         compressed archive cannot hold.
         """
         if "encoding" in self.archive().metadata:
@@ -123,7 +123,7 @@ class SplatField:
         return self._like(gaussians, self.metadata, levels, archive)
 
     def described(self, metadata: FieldMetadata) -> SplatField:
-        """Return the same splats with other metadata, another field."""
+        """Return another field with the same splats and other metadata."""
         old = self.archive()
         if old.kind != SPLATS:
             return SplatField(
@@ -141,14 +141,17 @@ class SplatField:
         archive: Archive,
         levels: LevelsOfDetail | None = None,
     ) -> SplatField:
-        """Return the field ``archive`` that has ``gaussians`` and ``levels``, None: this one's."""
+        """Return the field of ``archive``, a layer or delta on this one, with these splats.
+
+        ``levels``: ``None`` for this field's.
+        """
         levels = self.levels if levels is None else levels
         made = self._like(gaussians, metadata, levels, archive)
         made.base = self
         return made
 
     def with_threads(self, threads: int) -> SplatField:
-        """Return the same field with renderers of its own, of so many threads."""
+        """Return the same field with renderers of its own and so many threads."""
         own = copy(self)
         own.isa, own._threads = check_renderer(threads, self.isa), threads
         with self._lock:
@@ -158,13 +161,13 @@ class SplatField:
         return own
 
     def prepare(self, quality: Quality = FULL) -> None:
-        """Make the renderer of ``quality``; without this the first picture makes it."""
+        """Make the renderer of ``quality``, which otherwise the first picture makes."""
         self.rasterizer(quality.detail)
 
     def rasterizer(self, detail: float = 1.0) -> Rasterizer:
-        """Return the renderer of a level, made when it is first needed and kept.
+        """Return the renderer of a level, which is made at the first call and kept.
 
-        Raises ``InvalidInput`` for a level that is not here.
+        Raises ``InvalidInput`` for a level that was not loaded.
         """
         if detail > self.most_detail:
             raise InvalidInput("quality.detail", f"{detail:g} is above {self.most_detail:g}, here")
@@ -187,20 +190,20 @@ class SplatField:
 
     @property
     def is_on_device(self) -> bool:
-        """Whether an OpenCL device draws; none does once it failed."""
+        """True if an OpenCL device renders and has not failed."""
         with self._lock:
             drawn_by = [self.isa, *(each.isa for each in self._rasterizers.values())]
         return all(map(is_opencl, drawn_by))
 
     def field_view(self, camera: Camera, quality: Quality = FULL) -> FieldView:
-        """Render what a codec's end holds; with a device, the codec's picture is made there."""
+        """Render in the form of the codec; a device makes the codec's picture itself."""
         if quality.scale != 1:
             return field_view_from_view(self.render(camera, quality), camera)
         rasterizer = self.rasterizer(quality.detail)
         return rasterizer.field_view(camera, sh_degree=self._degree(quality))
 
     def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:
-        """Render colour alone, float32 [H, W, 3]: the bytes of ``render``, sooner."""
+        """Render only colour, float32 [H, W, 3]: the same bytes as ``render``, faster."""
         return colour_at_scale(self._colour, camera, quality)
 
     def _colour(self, camera: Camera, quality: Quality) -> NDArray[np.float32]:

@@ -139,7 +139,7 @@ class _Stream(Protocol):
 
 @dataclass(frozen=True)
 class _Header:
-    """What the header of any version says."""
+    """The header of a file of any version."""
 
     version: int
     count: int
@@ -149,13 +149,13 @@ class _Header:
 
     @property
     def splat_bytes(self) -> tuple[int, ...]:
-        """Of one splat: position, opacity, colour, scale, rotation, other bands."""
+        """Bytes of one splat: position, opacity, colour, scale, rotation, other bands."""
         rotation = 3 if self.version == 2 else 4
         return (9, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1) ** 2 - 1))
 
     @property
     def block_bytes(self) -> tuple[int, ...]:
-        """Of all of them, block by block."""
+        """Bytes of all splats, block by block."""
         return tuple(self.count * size for size in self.splat_bytes)
 
 

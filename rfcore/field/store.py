@@ -1,14 +1,14 @@
-"""Field files of every kind, and a directory of them addressed by field id.
+"""Reads and writes field files of every kind, and directories of them addressed by field id.
 
-``decode_field`` makes a field that renders out of an archive's bytes, ``encode_field`` the reverse;
-``READERS`` is the one place that knows which kinds of field there are.
+``decode_field`` turns an archive's bytes into a field that renders, ``encode_field`` does the
+reverse; ``READERS`` lists the kinds of field.
 
-A colour layer (``rfcore.field.layer``) and a delta (``rfcore.field.delta``) need their base, which
-``open_base`` finds by its id, or the folder that the file is in.
+A colour layer (``rfcore.field.layer``) and a delta (``rfcore.field.delta``) need their base field,
+which ``open_base`` opens by its id, or which is found in the file's folder.
 
 In a directory (``FieldStore``) a file named ``<field id>.rff`` is listed by its name, any other
-``.rff`` file by its SHA-256, so that ``street.rff`` may simply be put there. Contents are checked
-when a field is added or loaded.
+``.rff`` file by its SHA-256, so that a file like ``street.rff`` can simply be put there. Contents
+are checked when a field is added or loaded.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ __all__ = [
 
 
 OpenBase = Callable[[str], RadianceField]
-"""Opens the base of a layer by its id; raises ``UnknownField``."""
+"""Opens the base of a layer or delta by its id; raises ``UnknownField``."""
 
 
 @dataclass(frozen=True)
 class FieldFile:
-    """A checked archive, and how the field in it is to render."""
+    """A checked archive, and the settings of the field to be made from it."""
 
     archive: Archive
     metadata: FieldMetadata
@@ -85,7 +85,7 @@ def _delta(file: FieldFile) -> RadianceField:
 
 
 def _base(file: FieldFile) -> SplatField:
-    """Return the splats that a layer or a delta is of."""
+    """Return the base field of a layer or a delta."""
     kind, base_id = file.archive.kind, base_of(file.archive)
     if base_id is None or FIELD_ID.fullmatch(base_id) is None:
         raise InvalidInput(f"{kind}.base", f"{base_id!r} is no field id")
@@ -134,7 +134,7 @@ READERS: Mapping[str, Callable[[FieldFile], RadianceField]] = {
     LAYER: _layer,
     DELTA: _delta,
 }
-"""Makes the field of a file, by its archive's kind."""
+"""Functions that make the field of a file, by the archive's kind."""
 
 
 def encode_field(field: RadianceField) -> bytes:
@@ -143,7 +143,7 @@ def encode_field(field: RadianceField) -> bytes:
 
 
 def _no_base(field_id: str) -> RadianceField:
-    raise UnknownField(f"it is nothing without its base, field {field_id}: put both together")
+    raise UnknownField(f"it needs its base, field {field_id}: put both in one folder")
 
 
 def decode_field(
@@ -155,10 +155,10 @@ def decode_field(
     max_bytes: int = DECODED_BYTES,
     open_base: OpenBase = _no_base,
 ) -> RadianceField:
-    """Return the field of an archive; it takes ``max_bytes`` of memory at most.
+    """Return the field of an archive.
 
-    Raises ``FieldFormatError`` naming ``source`` if it is damaged or larger, and for a layer what
-    ``open_base`` raises.
+    Raises ``FieldFormatError`` naming ``source`` if it is damaged or takes more than ``max_bytes``
+    of memory, and for a layer what ``open_base`` raises.
     """
     archive = decode_archive(data, source)
     if archive.kind not in READERS:
@@ -182,10 +182,10 @@ def decode_beginning(
     isa: str | None = None,
     max_bytes: int = DECODED_BYTES,
 ) -> SplatField:
-    """Return the field ``field_id`` as far as ``data``, the first bytes of its archive, draws it.
+    """Return the part of the field ``field_id`` that the first bytes of its archive hold.
 
-    ``splat_archive.detail_ends`` says how many bytes that takes. Each array has the digest that the
-    header says; whether the whole is the field of that id shows when all of it is here. Raises
+    ``splat_archive.detail_ends`` says how many bytes each level of detail needs. The digest of each
+    array is checked; the field's id can only be checked once the archive is complete. Raises
     ``FieldFormatError`` if it is damaged, too large, or too short to draw anything.
     """
     archive = decode_archive(data, field_id, whole=False)
@@ -212,7 +212,7 @@ def load_field(
         paths = FieldFolder(path.parent).look().paths
         if field_id not in paths:
             raise UnknownField(
-                f"{path}: is of the base {field_id}, which {path.parent} lacks; put it there"
+                f"{path}: needs its base {field_id}, which is not in {path.parent}; put it there"
             )
         return load_checked(
             paths[field_id], field_id, threads=threads, isa=isa, max_bytes=max_bytes
@@ -243,7 +243,7 @@ def save_field(field: RadianceField, path: Path) -> str:
 
 
 class FieldStore:
-    """The fields of one directory, which is made if it is not there. Safe to share by processes."""
+    """The fields of one directory, which is created if missing. Processes may share it."""
 
     def __init__(self, directory: Path) -> None:
         directory.mkdir(parents=True, exist_ok=True)
@@ -251,11 +251,11 @@ class FieldStore:
         self._folder = FieldFolder(directory)
 
     def ids(self) -> tuple[str, ...]:
-        """Return the ids of the fields that are here, sorted."""
+        """Return the ids of the fields, sorted."""
         return tuple(sorted(self._files()))
 
     def path(self, field_id: str) -> Path:
-        """Return the file of a field; raise ``UnknownField`` naming it and what is here."""
+        """Return the file of a field; raise ``UnknownField`` listing the fields that exist."""
         files = self._files()
         if field_id not in files:
             here = ", ".join(sorted(files)) or "nothing"
@@ -285,9 +285,9 @@ class FieldStore:
     def add(self, source: bytes | Path, field_id: str | None = None) -> str:
         """Add an archive and return its id; the file appears whole or not at all.
 
-        When ``field_id`` is given the SHA-256 is compared before anything is parsed. Raises
-        ``FieldFormatError`` and leaves the store as it was when the archive is not whole, and
-        ``UnknownField`` for a layer whose base is not here.
+        If ``field_id`` is given, the SHA-256 is compared before anything is parsed. Raises
+        ``FieldFormatError`` for a damaged archive, which is not added, and ``UnknownField`` for a
+        layer whose base is not in the store.
         """
         data = read_file(source) if isinstance(source, Path) else source
         name = str(source) if isinstance(source, Path) else "field"

@@ -1,5 +1,5 @@
-"""What a live picture changes in a field, and several of those carried to another view of it; and
-cut-outs of pictures, upright at their own depth, drawn there.
+"""Live views: finds what a live picture changes in a field, carries the changes of several pictures
+to another view, and draws cut-outs of pictures there as upright planes.
 
 ``csrc/picture/live_view.cpp`` and ``patch.cpp`` compute exactly what is defined here, in float32
 without fused operations: the same bytes on every machine.
@@ -80,14 +80,14 @@ __all__ = [
 COVERED = 0.5
 """Opacity above which the field has a surface."""
 NOISE_LEVELS, CHANGE_LEVELS = 16.0, 32.0
-"""On the sample street, views from 1 to 3 m beside an unchanged drive lose up to 0.08 dB to what is
-no change; with 10 and 20 it is 0.17 dB, and what changed gains 0.3 dB less."""
+"""On the sample street, views from 1 to 3 m beside an unchanged drive lose up to 0.08 dB to false
+changes. With 10 and 20 levels they lose 0.17 dB, and real changes gain 0.3 dB less."""
 
 MOST_DISTANCE_M = 40.0
-"""How far from a camera its picture vouches."""
+"""Most distance from a camera at which its picture is used."""
 NEAREST_M = 0.1
 RELATIVE_DEPTH, ABSOLUTE_DEPTH_M = 0.08, 0.1
-"""As in the codec's warp: what differs more is another surface."""
+"""Depths that differ more belong to another surface, as in the codec's warp."""
 LEAST_COSINE = 0.5
 LEAST_RESOLUTION = 0.25
 
@@ -111,9 +111,9 @@ OWN_LIGHT = Light((1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
 
 @dataclass(frozen=True, eq=False)
 class LiveSource:
-    """A live picture's ``difference`` (float32 [H, W, 3]) and the field's ``depth`` (float32
-    [H, W], metres) at its ``camera``; ``weight`` and ``fade`` are of the whole picture; ``owner``:
-    a number of the vehicle, 0 to 2**24 (exact in float32)."""
+    """A live picture's ``difference`` (float32 [H, W, 3]) from the field, and the field's ``depth``
+    (float32 [H, W], metres) at its ``camera``. ``weight`` and ``fade`` apply to the whole picture;
+    ``owner`` is a number of the vehicle, 0 to 2**24 (exact in float32)."""
 
     camera: Camera
     difference: F32
@@ -141,9 +141,9 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """What is drawn on, the view of ``camera``: ``rgb`` uint8 [H, W, 3], ``depth`` float32 [H, W],
-    metres; ``chosen`` uint8 [H, W], whose picture a pixel is; ``nearest_m`` float32 [H, W], up to
-    which depth something is in front of what is there."""
+    """The view of ``camera`` to draw on: ``rgb`` uint8 [H, W, 3]; ``depth`` float32 [H, W] in
+    metres; ``chosen`` uint8 [H, W], the source of each pixel; ``nearest_m`` float32 [H, W], the
+    depth up to which something drawn is in front of the pixel."""
 
     camera: Camera
     rgb: Rgb
@@ -153,11 +153,11 @@ class Canvas:
 
 
 def live_difference(rgb: Rgb, view: View, light: Light, brightness: float = 1.0) -> tuple[F32, F32]:
-    """Return what ``rgb``, uint8 [H, W, 3], changes in the field that shows ``view`` there.
+    """Return how ``rgb``, uint8 [H, W, 3], differs from the field's ``view`` at the same camera.
 
-    ``brightness``: of the field's light; 1 is a day's. The first is the change in levels, float32
-    [H, W, 3]; the second, float32 [H, W], what share of the difference it is. Raises
-    ``InvalidInput`` for a picture of another size than the view.
+    ``brightness``: that of the field's light; 1 is daylight. The first result is the change in
+    levels, float32 [H, W, 3]; the second, float32 [H, W], is its share of the raw difference.
+    Raises ``InvalidInput`` for a picture of another size than the view.
     """
     if rgb.shape != view.colour.shape or rgb.dtype != np.uint8:
         raise InvalidInput(
@@ -179,9 +179,9 @@ def live_difference(rgb: Rgb, view: View, light: Light, brightness: float = 1.0)
 def carry_to_view(
     camera: Camera, view: View, sources: Sequence[LiveSource]
 ) -> tuple[Rgb, NDArray[np.uint8]]:
-    """Return ``view``, the field's render at ``camera``, with what ``sources`` change in it.
+    """Return ``view``, the field's render at ``camera``, with the changes of ``sources``.
 
-    The first is the picture, uint8 [H, W, 3]; the second, uint8 [H, W], which source vouches for a
+    The first result is the picture, uint8 [H, W, 3]; the second, uint8 [H, W], the source of each
     pixel, ``NOBODY`` where it is the field's. Raises ``InvalidInput`` for more than
     ``MOST_SOURCES``.
     """
@@ -218,9 +218,10 @@ def draw_patch(
     source: int,
     fade: float,
 ) -> None:
-    """Draw on ``canvas``, within rows and columns ``box``, what is seen of a ``patch`` of picture
-    ``source``; 0 < ``fade`` <= 1 of it is left. ``patch_from_view`` maps points of the view's axes
-    into those of the patch's camera.
+    """Draw a ``patch`` of picture ``source`` on ``canvas``, within the rows and columns ``box``.
+
+    ``fade``, above 0 and at most 1, is the patch's share of the colour. ``patch_from_view`` maps
+    points from the view's axes to those of the patch's camera.
 
     Raises ``InvalidInput`` for a box outside of the canvas, or a patch at no depth.
     """

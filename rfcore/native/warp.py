@@ -93,7 +93,7 @@ at dusk with a field of noon: 69, 379, 193, 220; with 3/4 of every difference 68
 with all of it 72, 394, 199, 207. The warp has 92, 411, 206, 226."""
 
 MOST_RELIT_PX = 1 << 24
-"""The sums of a larger picture could exceed 64 bits."""
+"""Largest picture whose sums fit 64 bits."""
 
 LIGHT_CELL_PX, LIGHT_BINS, LIGHT_PLANES, MOST_CHANGE = 64, 8, 3, 1 << 16
 
@@ -112,17 +112,17 @@ class BlockCosts:
 def warp_i420(previous: I420, before: FieldView, now: FieldView, threads: int = 1) -> I420:
     """Return ``previous``, taken at ``before``, as it would look from ``now.camera``.
 
-    Samples that are not known are those of ``now.render``. A device that holds the depths of both
-    makes the same picture. Raises ``InvalidInput`` for pictures of another size, cameras of
+    Unknown samples are taken from ``now.render``. A device that holds both depths makes the same
+    picture. Raises ``InvalidInput`` for pictures of another size, cameras of
     different intrinsics, or no threads.
     """
     return _carried(previous, None, before, now, threads)
 
 
 def correct_i420(previous: I420, before: FieldView, now: FieldView, threads: int = 1) -> I420:
-    """Return ``now.render`` plus most of what ``previous`` differed by from ``before.render``.
+    """Return ``now.render`` plus most of the difference of ``previous`` from ``before.render``.
 
-    The difference is carried from ``before.camera`` to ``now.camera``, by a device as above. Raises
+    The difference is carried from ``before.camera`` to ``now.camera``, as by ``warp_i420``. Raises
     ``InvalidInput`` for pictures of another size, cameras of different intrinsics, or no threads.
     """
     return _carried(previous, before.render, before, now, threads)
@@ -158,7 +158,7 @@ def _carried(
 
 
 def relight_i420(seen: I420, seen_render: I420, render: I420) -> I420:
-    """Return ``render`` under the light in which ``seen`` differs from ``seen_render``, its render.
+    """Return ``render`` under the light of ``seen``, whose render is ``seen_render``.
 
     Raises ``InvalidInput`` for pictures of another size, without samples, or above 2**24 px.
     """
@@ -174,7 +174,7 @@ def relight_i420(seen: I420, seen_render: I420, render: I420) -> I420:
 
 
 def light_shape(size_px: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the shape of a light that is sent: rows, columns, bins and planes."""
+    """Return the shape of a light to be sent: rows, columns, bins and planes."""
     width_px, height_px = size_px
     return -(-height_px // LIGHT_CELL_PX), -(-width_px // LIGHT_CELL_PX), LIGHT_BINS, LIGHT_PLANES
 
@@ -194,7 +194,7 @@ def solve_light(frame: I420, render: I420) -> NDArray[np.int32]:
 
 
 def apply_light(render: I420, changes: NDArray[np.int32]) -> I420:
-    """Return ``render`` under a light: ``changes`` as ``solve_light`` returns them.
+    """Return ``render`` under the light ``changes``, as ``solve_light`` returns it.
 
     Raises ``InvalidInput`` for changes of another shape or beyond 2**16, and for pictures without
     samples or above 2**24 px.
@@ -224,7 +224,7 @@ def warp_numbers(before: Camera, now: Camera) -> list[float]:
 
 
 def block_costs(frame: NDArray[np.uint8], reference: NDArray[np.uint8]) -> BlockCosts:
-    """Return what predicting the luma plane ``frame`` from ``reference`` leaves, block by block."""
+    """Return the residual of predicting the luma plane ``frame`` from ``reference``, by blocks."""
     if frame.shape != reference.shape:
         raise InvalidInput("reference", f"shape {reference.shape} of a frame {frame.shape}")
     shape = (frame.shape[0] // BLOCK_PX, frame.shape[1] // BLOCK_PX)

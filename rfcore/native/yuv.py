@@ -1,7 +1,7 @@
 """RGB <-> I420: BT.709, limited range, integers only, the same bytes on every machine.
 
-Both ends of a stream turn their renders into codec pictures, so this conversion is part of what
-must be bit-exact. It is defined here by integers; ``csrc/picture/yuv.cpp`` computes exactly this.
+Both ends of a stream convert their renders to codec pictures, so this conversion must be bit-exact.
+It is defined here by integers; ``csrc/picture/yuv.cpp`` computes exactly this.
 
 Forward (ITU-R BT.709-6 section 3, 8 bits, with Kr = 0.2126, Kb = 0.0722). Coefficients are the
 exact ones times 2**16, rounded so that the luma row sums to round(219 / 255 * 2**16) and the
@@ -96,7 +96,7 @@ def _require_picture(name: str, array: NDArray[np.generic], dtype: type[np.gener
 
 
 def digest_pair(first: I420, second: I420) -> tuple[bytes, bytes]:
-    """Return ``first.digest()`` and ``second.digest()``, sooner.
+    """Return ``first.digest()`` and ``second.digest()``, computed together and faster.
 
     BLAKE2b is one chain of dependent steps, so a processor hashing one message waits most of the
     time. The kernel (``csrc/picture/blake2b.cpp``) takes two messages step by step together: both

@@ -1,4 +1,4 @@
-"""The native hash grid renderer: what everything but tests renders with.
+"""The native hash grid renderer, which everything but tests uses.
 
 The same function as ``rfcore.ngp.reference``, whose docstrings define it, in float32 and bit-exact:
 the same field and camera give the same bytes on every instruction set and thread count.
@@ -25,8 +25,7 @@ def ngp_camera(camera: Camera) -> _native.NgpCamera:
 
 
 class NgpRenderer:
-    """A copy of one hash grid field, ready to be rendered; threads that share it render at the same
-    time.
+    """A copy of one hash grid field, ready to be rendered; threads may render with it in parallel.
 
     ``isa`` and ``threads`` as in ``rfcore.raster.native.Rasterizer``: neither changes a byte.
     """
@@ -50,7 +49,7 @@ class NgpRenderer:
             self.isa,
         )
         self.samples = 0
-        """Evaluated for the last picture."""
+        """Samples evaluated for the last picture."""
 
     def render(self, camera: Camera, samples_per_ray: int | None = None) -> View:
         """Render colour, depth and opacity; see ``reference.render`` for ``samples_per_ray``."""
@@ -63,7 +62,7 @@ class NgpRenderer:
         return view
 
     def render_colour(self, camera: Camera, samples_per_ray: int | None = None) -> F32:
-        """Render colour [H, W, 3] alone: the same bytes as ``render``'s."""
+        """Render only colour [H, W, 3]: the same bytes as ``render``."""
         colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
         seen_from = ngp_camera(camera)
         self.samples = self._native.render_colour(seen_from, samples_per_ray or 0, colour)

@@ -4,8 +4,7 @@ Names as in Mueller et al., "Instant Neural Graphics Primitives with a Multireso
 Encoding", ACM TOG 41(4), 2022 (below: NGP): L levels of at most T entries of F features, N_l cells
 on level l. Positions are metres relative to the tile's origin until ``Space`` maps them to 0..1.
 
-The numbers of a hash grid field: the table, five matrices, one bit per cell.
-
+The parameters of a hash grid field are the table, five matrices, and one bit per cell.
 ``matrices`` holds W0 [H, E], W1 [16, H] (density: encoding in, log density and 15 more out) and
 W2 [H, 32], W3 [H, H], W4 [3, H] (colour: 16 harmonics of the direction and the 16 outputs of the
 density network in), row-major, one after the other. No biases (NGP, section 4).
@@ -170,7 +169,7 @@ class Marching:
 
 @dataclass(frozen=True)
 class NgpShape:
-    """Everything about a field but its numbers.
+    """Everything about a field except its parameters.
 
     ``hidden``: width of the hidden layers, 16, 32, 48 or 64; ``occupancy_cells`` along x, y, z.
     """
@@ -201,7 +200,7 @@ class NgpShape:
 
 
 OUTPUTS = 16
-"""Of the density network."""
+"""Outputs of the density network."""
 HARMONICS = 16
 TABLE_RANGE = 1e-4
 """Entries of a new table are uniform in +- this (NGP, section 4)."""
@@ -263,7 +262,7 @@ def matrix_shapes(shape: NgpShape) -> tuple[tuple[int, int], ...]:
 
 
 def initial_parameters(shape: NgpShape, occupancy: U32, rng: np.random.Generator) -> NgpParameters:
-    """Return what training starts from: a small uniform table, matrices after He et al. 2015."""
+    """Return random parameters to start training: a small uniform table, matrices after He 2015."""
     grid = shape.grid
     entries = table_entries(grid)
     table = (rng.random((entries, FEATURES), dtype=np.float32) * 2 - 1) * np.float32(TABLE_RANGE)

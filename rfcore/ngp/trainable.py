@@ -1,8 +1,8 @@
 """Training on the native kernels: forward, squared error, backward and Adam without leaving C++.
 
 Gradients are those of ``rfcore.ngp.reference`` in float64 to within rounding; like the pictures,
-they do not depend on instruction set or number of threads: blocks of rays have a fixed size, what
-they add up is added in their order, and one task goes through all samples of a level of the table.
+they do not depend on instruction set or number of threads: blocks of rays have a fixed size, their
+sums are added in order, and one task goes through all samples of a level of the table.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class NgpRates:
 
 
 class TrainableNgp:
-    """A field being optimised; parameters, Adam's moments and the grid's peaks live in the kernels.
+    """A field being optimised; the kernels hold parameters, Adam's moments and the grid's peaks.
 
     Adam moves the numbers whose gradient is not 0, and only their moments decay. A cell's peak is
     the largest optical thickness of a sample there, faded by every visit; ``rebuild_occupancy``

@@ -99,7 +99,7 @@ def empty_arrays(count: int, sh_degree: int) -> dict[str, F32]:
 def sky_of(means: F32) -> NDArray[np.bool_]:
     """Return which of the means [N, 3] are further than ``SKY_M`` from their median on an axis.
 
-    None where that is half of them or more: a scene may be that large.
+    If that is half of them or more, none is sky: a scene may be that large.
     """
     if not len(means) or np.ptp(means, axis=0).max() <= SKY_M:
         return np.zeros(len(means), np.bool_)  # without finding the median, which takes longer
@@ -109,7 +109,7 @@ def sky_of(means: F32) -> NDArray[np.bool_]:
 
 
 def with_sky_at(gaussians: Gaussians, distance_m: float) -> Gaussians:
-    """Return ``gaussians`` with the sky so far from the median of all, as wide to the eye there."""
+    """Return ``gaussians`` with the sky moved to this distance, at the same angular size."""
     is_sky = sky_of(gaussians.means)
     if not is_sky.any():
         return gaussians

@@ -1,4 +1,4 @@
-"""The native rasterizer: what everything but tests renders with.
+"""The native rasterizer, which everything but tests uses.
 
 The same function as ``rfcore.raster.reference``, whose docstrings define it, in float32 and
 bit-exact: the same Gaussians and camera give the same bytes on every instruction set, for every
@@ -49,14 +49,14 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True)
 class RasterStatistics:
-    """What one picture cost, counted by the same loop that draws it."""
+    """Work of one picture, counted by the same loop that draws it."""
 
     visible: int
     """Gaussians that could colour a pixel."""
     tile_entries: int
     """Overlaps of Gaussians and 16x16 tiles."""
     tile_entries_visited: int
-    """Those looked at before their tile was opaque."""
+    """Overlaps visited before their tile was opaque."""
     useful_blends: int
     """(pixel, Gaussian) pairs that changed the picture."""
     evaluated_blends: int
@@ -66,7 +66,8 @@ class RasterStatistics:
 
 
 def native_camera(camera: Camera) -> _native.RasterCamera:
-    """Return the camera as the kernels take it: float32, rounded once; the position as two."""
+    """Return the camera in the kernels' form: float32, rounded once; the position as two
+    numbers."""
     k = camera.intrinsics
     rotation = camera.cam_from_world().rotation_matrix()
     numbers = camera_numbers(rotation, camera.world_from_cam.translation_m, k)
@@ -96,7 +97,7 @@ def overlaps_limited() -> Iterator[None]:
 
 
 def check_renderer(threads: int, isa: str | None) -> str:
-    """Return what to render with, as ``check_backend``; an OpenCL device is opened and checked.
+    """Return the checked instruction set or OpenCL device, which is opened and tested.
 
     Raises ``BackendUnavailable`` also for a device whose bytes are not those of the CPU.
     """
@@ -112,15 +113,15 @@ def check_renderer(threads: int, isa: str | None) -> str:
 class Rasterizer:
     """A copy of one set of Gaussians, ready to be rendered; may be shared between threads.
 
-    The CPU draws pictures for several threads at the same time, an OpenCL device one by one.
+    The CPU draws for several threads at the same time, an OpenCL device one picture after another.
     ``isa`` forces one of ``available_isas()`` (default: the best) or an OpenCL device; ``threads``
     is 1..256. Neither changes a byte of any picture. ``antialiased`` must be what the Gaussians
     were trained with. Raises ``BackendUnavailable`` or ``InvalidInput``. Rendering raises
     ``InvalidInput`` when the Gaussians overlap more than 2^28 regions of 64x64 pixels, and for an
     ``sh_degree`` they lack.
 
-    When an OpenCL device fails, the CPU draws the same picture and every one after it, and again
-    what only the device had of those before: ``isa`` says so from then on, and a line is logged.
+    When an OpenCL device fails, the CPU draws that picture and all later ones, and redraws planes
+    that only the device held. ``isa`` changes accordingly, and a line is logged.
     """
 
     def __init__(
@@ -146,10 +147,10 @@ class Rasterizer:
             self._cpu = self._native_rasterizer(gaussians, self.isa)
 
     def with_threads(self, threads: int) -> Rasterizer:
-        """Return what draws the same Gaussians with so many threads, and waits for no other.
+        """Return an independent renderer of the same Gaussians with so many threads.
 
-        On the CPU they are shared, on an OpenCL device copied. Raises ``InvalidInput`` for another
-        number than 1..256.
+        On the CPU the Gaussians are shared, on an OpenCL device copied. Raises ``InvalidInput`` for
+        another number than 1..256.
         """
         isa = check_renderer(threads, self.isa)
         if self._gaussians is not None:
@@ -169,16 +170,15 @@ class Rasterizer:
         return view
 
     def render_colour(self, camera: Camera, *, sh_degree: int | None = None) -> F32:
-        """Render colour [H, W, 3] alone: the same bytes as ``render``'s, a little sooner."""
+        """Render only colour [H, W, 3]: the same bytes as ``render``, a little faster."""
         colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
         self._draw(camera, sh_degree, colour)
         return colour
 
     def field_view(self, camera: Camera, *, sh_degree: int | None = None) -> FieldView:
-        """Render what a codec's end holds: ``render``, with the colours as a codec picture.
+        """Render in the form of the codec: as ``render``, with the colours as a codec picture.
 
-        A device makes that picture itself. The colours stay there, depth and opacity until somebody
-        asks for them.
+        A device makes that picture itself; depth and opacity stay there until the first request.
         """
         made = None if self._device is None else self._view_of_device(camera, sh_degree)
         if made is not None:
@@ -186,7 +186,7 @@ class Rasterizer:
         return field_view_from_view(self.render(camera, sh_degree=sh_degree), camera)
 
     def statistics(self, camera: Camera) -> RasterStatistics:
-        """Count what rendering this view takes on the CPU; slower than rendering it."""
+        """Count the work of rendering this view on the CPU; it is slower than rendering."""
         seen_from = native_camera(camera)
         with overlaps_limited():
             counts = self._on_cpu().statistics(seen_from)
@@ -213,7 +213,7 @@ class Rasterizer:
                 self._on_cpu().render(seen_from, degree, colour, depth, opacity)
 
     def _view_of_device(self, camera: Camera, sh_degree: int | None) -> FieldView | None:
-        """Return what the device makes of the whole; None where it cannot."""
+        """Return the view rendered by the device; None if it cannot."""
         k, degree = camera.intrinsics, bands_to_use(sh_degree, self.sh_degree)
         native_camera(camera)  # raises for what the kernels do not take
         picture = I420.empty((k.width_px, k.height_px))
@@ -231,7 +231,7 @@ class Rasterizer:
         return HeldFieldView.of(camera, picture, depth, opacity)
 
     def _drawn_by_device(self, draw: Callable[[DeviceRasterizer], object]) -> bool:
-        """Have the device do its work; False where there is none, or it cannot."""
+        """Run ``draw`` on the device; return False if there is none or it cannot."""
         if self._device is None:
             return False
         from rfcore.raster.opencl import DeviceFull, DeviceLost
@@ -267,7 +267,7 @@ class Rasterizer:
         log.error("opencl device lost", reason=str(error), isa=self.isa)
 
     def _on_cpu(self) -> _native.Rasterizer:
-        """Return the native renderer; of Gaussians on a device, made when it is first needed."""
+        """Return the native renderer, which for Gaussians on a device is made at the first call."""
         with self._lock:
             if self._cpu is None:
                 assert self._gaussians is not None
@@ -281,7 +281,7 @@ class Rasterizer:
 
 
 class _PlaneOnDevice:
-    """A ``HeldPlane`` that ``rasterizer`` drew; ``again`` draws it when the device was lost."""
+    """A ``HeldPlane`` that ``rasterizer`` drew; ``again`` redraws it if the device was lost."""
 
     def __init__(self, rasterizer: Rasterizer, plane: DrawnPlane, again: Callable[[], F32]) -> None:
         self._rasterizer, self._plane, self._again = rasterizer, plane, again

@@ -40,7 +40,8 @@ MIN_TRANSMITTANCE = 1e-4
 MIN_QUATERNION_NORM = 1e-12
 """A shorter quaternion counts as no rotation."""
 MIN_DET_RATIO = 1e-6
-"""Of the antialiased mode. Under MIN_ALPHA^2, so nothing it clamps is ever drawn."""
+"""Least ratio of determinants in the antialiased mode. It is below MIN_ALPHA^2, so what it clamps
+is never drawn."""
 EXTENT_SIGMAS = 3.33
 """No alpha reaches 1/255 beyond sqrt(2 ln 255) = 3.3290 standard deviations."""
 TILE_PX = 16

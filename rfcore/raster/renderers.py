@@ -1,6 +1,6 @@
-"""Names of renderers, ``cpu`` or ``opencl[:DEVICE]``, and what became of this process's devices.
+"""Names of renderers, ``cpu`` or ``opencl[:DEVICE]``, and a record of this process's devices.
 
-Nothing is loaded to read them.
+It does not import OpenCL.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ CPU, OPENCL = "cpu", "opencl"
 
 @dataclass
 class DeviceRecord:
-    """The OpenCL devices that passed their self-check, and how often the CPU stood in for one.
+    """The OpenCL devices that passed their self-check, and how often the CPU replaced one.
 
-    For metrics; any thread may add to it.
+    It serves metrics; any thread may add to it.
     """
 
     opened: list[tuple[str, str, str]] = field(default_factory=list)
-    """Name, driver and build of each."""
+    """Name, driver and build of each device."""
     lost: int = 0
-    """Renderers that left a failed device for good."""
+    """Renderers whose device failed."""
     full: int = 0
-    """Single pictures that a device could not hold."""
+    """Pictures that were too large for a device."""
     _lock: Lock = field(default_factory=Lock)
 
     def add_opened(self, name: str, driver: str, build: str) -> None:
-        """A device passed its check; one that was opened by two names counts once."""
+        """Record a device that passed its check; one that was opened by two names counts once."""
         with self._lock:
             if (name, driver, build) not in self.opened:
                 self.opened.append((name, driver, build))
 
     def add_lost(self) -> None:
-        """A renderer left its device."""
+        """Count a renderer whose device failed."""
         with self._lock:
             self.lost += 1
 
     def add_full(self) -> None:
-        """A picture was drawn by the CPU instead."""
+        """Count a picture that the CPU drew instead."""
         with self._lock:
             self.full += 1
 
 
 DEVICES = DeviceRecord()
-"""Of this process."""
+"""The devices of this process."""
 
 
 def is_opencl(isa: str | None) -> bool:
@@ -57,7 +57,7 @@ def is_opencl(isa: str | None) -> bool:
 
 
 def renderer_isa(renderer: str, isa: str | None = None) -> str | None:
-    """Return what to render with: ``isa`` for the renderer ``cpu``, else the OpenCL device.
+    """Return the instruction set ``isa`` for the renderer ``cpu``, else the OpenCL device.
 
     Raises ``InvalidInput`` for a renderer that is neither ``cpu`` nor ``opencl[:DEVICE]``, and for
     an instruction set beside an OpenCL device.

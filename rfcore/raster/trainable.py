@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 DEAD_LOGIT = -5.293305
-"""An opacity of 0.005: less is not told from nothing on an 8-bit display."""
+"""An opacity of 0.005; less is invisible on an 8-bit display."""
 DSSIM_WEIGHT = 0.2
 """Share of D-SSIM in the loss (Kerbl et al. 2023, eq. 7)."""
 
@@ -56,9 +56,9 @@ class LearningRates:
     beta2: float = 0.999
     epsilon: float = 1e-15
     opacity_pull: float = 0.0
-    """Regularisation: what the opacity of a visible Gaussian adds to the loss, times this."""
+    """Regularisation: a visible Gaussian adds its opacity times this to the loss."""
     scale_pull: float = 0.0
-    """The same for each of its three scales in metres."""
+    """Regularisation: each of its three scales in metres adds this times the scale."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -113,7 +113,7 @@ class Exposure:
 
 @dataclass(frozen=True)
 class TrainingState:
-    """Everything a run goes on from: parameters, Adam's moments and powers, density scores.
+    """The complete state of a run: parameters, Adam's moments and powers, density scores.
 
     ``scores`` float32 [N, 2]: sum of the gradients of the centre, number of views.
     """
@@ -135,7 +135,7 @@ class TrainingState:
 
 
 class TrainableRasterizer:
-    """A set of Gaussians being optimised; parameters and Adam's moments live in the kernels.
+    """A set of Gaussians being optimised; the kernels hold parameters and Adam's moments.
 
     Adam is sparse: a step moves the Gaussians that were visible in the last ``forward``, and only
     their moments decay. Gradients that are not finite or beyond 1e15 count as zero. One thread at
@@ -169,7 +169,7 @@ class TrainableRasterizer:
     def forward(self, camera: Camera, *, sh_degree: int | None = None) -> View:
         """Render ``camera`` with the bands up to ``sh_degree`` (default: all of them).
 
-        The view's colour is read-only: ``loss`` and ``backward`` go back to it.
+        The view's colour is read-only, because ``loss`` and ``backward`` use it.
         """
         shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
         view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
@@ -259,7 +259,7 @@ class TrainableRasterizer:
         return Gaussians(**arrays)
 
     def keep_scores(self, keep: bool) -> None:
-        """Say whether steps note what ``DensityStep.by_gradient`` needs."""
+        """Choose whether steps record the scores that ``DensityStep.by_gradient`` needs."""
         self._native.keep_scores(keep)
 
     def control_density(self, step: DensityStep) -> int:
@@ -296,7 +296,7 @@ class TrainableRasterizer:
             self._native.order_along_curve()
 
     def state(self) -> TrainingState:
-        """Return a copy of everything a run goes on from."""
+        """Return a copy of the complete state of the run."""
         first, second = self._empty_arrays(), self._empty_arrays()
         powers, scores = np.empty(2), np.empty((len(self), 2), np.float32)
         with self._lock:
@@ -308,7 +308,7 @@ class TrainableRasterizer:
         )
 
     def set_optimiser(self, state: TrainingState) -> None:
-        """Go on from ``state``, made of as many Gaussians; its parameters are not looked at."""
+        """Go on from the moments and scores of ``state``, which has as many Gaussians."""
         if len(state.gaussians) != len(self):
             raise InvalidInput(
                 "training state", f"of {len(state.gaussians)} Gaussians, these are {len(self)}"

@@ -1,7 +1,8 @@
-"""A training run on disk: everything it goes on from, so that it ends with the same bytes.
+"""Checkpoints: the complete state of a training run on disk, from which it ends with the same
+bytes.
 
-The container is that of fields (``rfcore.field.archive``), of kind ``checkpoint``: every byte is
-under a digest, and a file is replaced whole or not at all.
+The container is that of fields (``rfcore.field.archive``), of kind ``checkpoint``: digests cover
+every byte, and a file is replaced whole or not at all.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ KIND = "checkpoint"
 class Checkpoint:
     """A run after ``iteration`` iterations.
 
-    ``kind`` and ``training_digest`` say of which run; ``values`` are JSON and ``arrays`` numbers
-    that only its trainer understands.
+    ``kind`` and ``training_digest`` identify the run; ``values`` (JSON) and ``arrays`` are the
+    trainer's own.
     """
 
     kind: str
@@ -38,7 +39,7 @@ class Checkpoint:
     arrays: Mapping[str, NDArray[Any]]
 
     def check(self, kind: str, training_digest: str) -> None:
-        """Raise ``InvalidInput`` unless this is of the run ``training_digest``."""
+        """Raise ``InvalidInput`` unless this belongs to the run ``training_digest``."""
         if (self.kind, self.training_digest) != (kind, training_digest):
             raise InvalidInput(
                 "checkpoint",

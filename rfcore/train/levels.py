@@ -1,8 +1,8 @@
 """Fits the lower levels of detail of a splat field to the full field, without training pictures.
 
-The splats are put in order of what they contribute to the cameras given. A level is then the first
-of them, and to fill the gaps its scales and opacities are optimised against the full field's own
-renders; means, rotations and colours stay, so a level costs four numbers a splat and no more.
+The splats are ordered by their contributions to the given cameras. A level consists of the first of
+them. To fill the gaps, its scales and opacities are optimised against the full field's own renders;
+means, rotations and colours stay, so a level costs only four numbers a splat.
 
 Measured on the held-out drive of the first sample (150k splats, 27.14 dB), half of the splats:
 prefix alone 24.22 dB; all wider by e^0.1, 25.48 dB; opacities and scales fitted for 240 / 360
@@ -29,21 +29,21 @@ from rfcore.train.schedule import view_order
 __all__ = ["LevelFitConfig", "Progress", "fitted", "with_levels"]
 
 Progress = Callable[[int, int], None]
-"""Told how many steps are done and how many there are."""
+"""Called with the number of steps done and the number of all steps."""
 
 
 @dataclass(frozen=True)
 class LevelFitConfig:
-    """How to fit. ``threads`` changes how long it takes, nothing else."""
+    """Settings of the fit. ``threads`` changes only the time it takes."""
 
     iterations: int = 240
-    """Per level; 0 leaves every level a plain prefix."""
+    """Iterations per level; 0 leaves every level a plain prefix."""
     log_scales_rate: float = 2e-2
     opacity_rate: float = 5e-2
     widening: float = 0.15
     """Added to the log scales before the first iteration of each level."""
     final_factor: float = 0.02
-    """What is left of the rates at the end; they fall in the second half."""
+    """Factor on the rates at the end; they fall in the second half."""
     seed: int = 0
     threads: int = 1
 
@@ -77,8 +77,8 @@ def with_levels(
 ) -> SplatField:
     """Return the field with its splats in order of importance and its lower levels fitted.
 
-    ``keep_order``: leave the splats in the field's order. ``cameras`` are those the field is to be
-    seen from, as the training views'. The full level draws the same splats as before. Raises
+    ``keep_order``: leave the splats in the field's order. ``cameras``: those the field will be seen
+    from, such as the training views. The full level draws the same splats as before. Raises
     ``InvalidInput`` when there is no camera.
     """
     settings = config if config is not None else LevelFitConfig()

@@ -5,9 +5,9 @@ samples, not rays, in every iteration. The same pictures, points, settings and s
 field to the last bit, whatever the instruction set and the number of threads, and whether or not
 the run was interrupted.
 
-The box of the grid holds the cameras and what is near them; the contraction takes care of the rest.
-Points, where a dataset has any, say which cells can hold a surface, and training begins with those
-alone: on the street that is one cell in twenty.
+The box of the grid holds the cameras and what is near them; the rest of space is contracted.
+If a dataset has points, training begins with only the cells near them occupied, which on the sample
+street is one cell in twenty.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ __all__ = [
 ]
 
 MARGIN_SHARE = 0.01
-"""Of the box's longest side, added around the points in it."""
+"""Margin around the points in the box, as a share of its longest side."""
 KEPT_SHARE = 0.995
-"""Of the points near the cameras lie in the box, along each axis and side."""
+"""Share of the points near the cameras that lies in the box, along each axis and side."""
 SAMPLE = 8192
-"""Points looked at to find how far surfaces are from the cameras."""
+"""Points that are used to find how far surfaces are from the cameras."""
 
 F64 = NDArray[np.float64]
 Cells = tuple[int, int, int]
@@ -82,7 +82,7 @@ def _shares(points: PointCloud | None) -> tuple[float, float]:
 
 
 def _looked_at(cameras: Sequence[Camera], centres: F64) -> F64:
-    """Return the points before the cameras at once and twice the radius of their positions."""
+    """Return points in front of the cameras, at half and all of the radius of their positions."""
     axes = np.array([camera.world_from_cam.rotation_matrix() for camera in cameras])[:, :, 2]
     radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     reach_m = max(float(radius), 1.0)
@@ -128,37 +128,38 @@ def cells_near(space: Space, cells: Cells, points: PointCloud) -> NDArray[np.boo
 
 
 BLOCKS = 16
-"""Tasks of a batch; part of the definition, since sums are made block by block."""
+"""Tasks of a batch; their number affects the result, since sums are made block by block."""
 MAX_SAMPLES = 8192
-"""Of a block: memory for twice what it has on average."""
+"""Most samples of a block: twice its average."""
 REBUILD_EVERY = 64
 """Iterations after which the occupied cells are found anew."""
 FIRST_SAMPLES_PER_RAY = 64.0
 FIRST_PEAK = 2.0
-"""Of a cell, times the threshold: kept until a dozen visits have found it empty."""
+"""First peak of a cell, times the threshold: a dozen visits must find it empty to drop it."""
 BLIND_SHARE = 1 / 15
-"""Of the occupancy's cells, without points: all begin occupied, and each has to be visited."""
+"""Share of the occupancy's cells without points, when all cells start occupied and need visits."""
 
 
 @dataclass(frozen=True)
 class NgpModel:
-    """How large a field is: L, T, N_min and N_max as in the paper."""
+    """The size of a field: L, T, N_min and N_max as in the paper."""
 
     L: int = 16
     log2_T: int = 18
     N_min: int = 16
     N_max: int = 4096
-    """Cells along the longest side, of all space: the box is half of that."""
+    """Cells along the longest side of the contracted space, of which the box is half."""
     hidden: int = 32
     occupancy: int = 30_000_000
-    """Cells of the occupancy grid, about. With N_max 4096 and 64 steps, the street's held-out drive
-    is at 23.3 dB after 1000 iterations instead of 23.0 dB with 2048, 8 million and 48."""
+    """Approximate number of cells of the occupancy grid. With N_max 4096 and 64 steps, the street's
+    held-out drive is at 23.3 dB after 1000 iterations instead of 23.0 dB with 2048, 8 million and
+    48."""
     steps_per_doubling: int = 64
-    """Steps along a ray until its distance has doubled: 64 are a step of 1.1 % of it."""
+    """Steps along a ray until its distance has doubled: with 64 a step is 1.1 % of the distance."""
     near_share: float = 0.008
-    """Where rays begin, in longest half sides of the box."""
+    """Start of rays, in units of the longest half side of the box."""
     far_share: float = 8.0
-    """Where they end."""
+    """End of rays, in the same unit."""
 
 
 @dataclass(frozen=True)
@@ -190,11 +191,11 @@ class NgpSchedule:
 
 @dataclass(frozen=True)
 class NgpTrainingConfig:
-    """How to train. ``threads`` and ``isa`` change how long it takes, nothing else."""
+    """Settings of a training run. ``threads`` and ``isa`` change only the time it takes."""
 
     iterations: int = 10_000
     batch_samples: int = 65_536
-    """Samples of an iteration, about."""
+    """Approximate number of samples of an iteration."""
     model: NgpModel = field(default_factory=NgpModel)
     schedule: NgpSchedule = field(default_factory=NgpSchedule)
     threads: int = 1
@@ -212,7 +213,7 @@ class NgpTrainingConfig:
 
 @dataclass(frozen=True)
 class _Groups:
-    """What can diverge."""
+    """The groups of parameters that may diverge."""
 
     table: NDArray[np.float32]
     matrices: NDArray[np.float32]
@@ -252,7 +253,7 @@ class NgpTrainer(FieldTrainer):
 
     @property
     def primitives(self) -> int:
-        """How many numbers are being learned."""
+        """The number of parameters being learned."""
         return self._numbers
 
     def field(
@@ -268,7 +269,7 @@ class NgpTrainer(FieldTrainer):
         return NgpField(numbers, metadata, threads=config.threads, isa=config.isa)
 
     def checkpoint(self) -> Checkpoint:
-        """Return what ``restore`` of a trainer made of the same things goes on from."""
+        """Return the state for ``restore`` of a trainer with the same inputs."""
         values = {"samples_per_ray": self._samples_per_ray, "watch": self._watch.values()}
         state = self._trainable.state()
         return Checkpoint(self.kind, self.training_digest, self.iteration, values, state)

@@ -1,4 +1,4 @@
-"""What changes over a training run: step sizes, bands, the order of the views, the Gaussians.
+"""Schedules of a training run: step sizes, bands, the order of the views, density control.
 
 ``progress`` runs from 0 at the first iteration towards 1 after the last.
 
@@ -30,10 +30,10 @@ __all__ = [
 ]
 
 ORDER_INTERVAL = 500
-"""Iterations between two sorts along the curve. A round of density control adds at the end what
-lies next to its sources, in their order, so only many rounds take memory and space apart."""
+"""Iterations between two sorts along the curve. A round of density control appends new Gaussians in
+the order of their sources, so the order degrades only over many rounds."""
 NOISE_INTERVAL = 10
-"""Iterations between two moves of the faint: moving them by less, more often, gives the same."""
+"""Iterations between two random moves of faint Gaussians; smaller moves more often do the same."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class RateSchedule:
     """
 
     means: float = 0.04
-    """In units of the median initial standard deviation, so that it suits any unit of length."""
+    """Rate in units of the median initial standard deviation, which suits any unit of length."""
     log_scales: float = 2.5e-2
     quaternions: float = 5e-3
     opacity_logits: float = 5e-2
@@ -54,7 +54,7 @@ class RateSchedule:
     held_share: float = 0.7
     """Share of the run with constant rates."""
     final_factor: float = 0.02
-    """What is left of every rate at the end."""
+    """Factor on every rate at the end."""
     means_fall: float = 0.1
     """A further factor on the means' rate at the end, reached by falling during the whole run."""
 
@@ -69,7 +69,7 @@ class RateSchedule:
                 raise InvalidInput(f"rates.{name}", f"{getattr(self, name)} is outside 0..1")
 
     def factor(self, progress: float) -> float:
-        """Return what is left of the rates at ``progress``, 1 to begin with."""
+        """Return the factor on the rates at ``progress``, which starts at 1."""
         fall = max(0.0, (progress - self.held_share) / (1.0 - self.held_share))
         return float(self.final_factor**fall)
 
@@ -88,7 +88,7 @@ class RateSchedule:
 
 @dataclass(frozen=True)
 class Regularisation:
-    """What is added to the loss: so much times the mean opacity and the mean scale in metres.
+    """Weights of the mean opacity and the mean scale in metres, which are added to the loss.
 
     MCMC (Kheradmand et al. 2024, eq. 10) takes 0.01 for both: it makes Gaussians that do not pay
     for themselves fade, and with that frees them for density control.
@@ -114,10 +114,10 @@ class Regularisation:
 
 @dataclass(frozen=True)
 class Bands:
-    """Which bands of the spherical harmonics are learned, and from when."""
+    """The bands of the spherical harmonics that are learned, and when they join."""
 
     degree: int = 3
-    """The field's, 0..3."""
+    """Degree of the field, 0..3."""
     rise: float = 0.0
     """Share of the run after which one more band joins, beginning with none; 0 has all at once."""
 
@@ -140,10 +140,10 @@ def view_order(views: int, rng: np.random.Generator) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class DensityControl:
-    """How the set of Gaussians changes; ``limit`` 0 keeps the set it starts with."""
+    """Settings of density control; ``limit`` 0 keeps the first set of Gaussians."""
 
     limit: int = 0
-    """At most so many Gaussians; the ones the run starts with count."""
+    """Most Gaussians, including those of the start."""
     drawn_by: Literal["opacity", "gradient"] = "gradient"
     split: Literal["in_place", "long_axis"] = "long_axis"
     interval: int = 100
@@ -154,7 +154,7 @@ class DensityControl:
     stop: float = 0.6
     """Shares of the run between which rounds take place."""
     noise: float = 0.0
-    """Random moves of the faint, in their own deviations, at full learning rate."""
+    """Size of random moves of faint Gaussians, in their standard deviations, at full rate."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.limit <= MAX_GAUSSIANS:
@@ -192,7 +192,7 @@ def control_density(
     progress: float,
     seed: int,
 ) -> None:
-    """Do what ``control`` asks for after an iteration."""
+    """Do a round of density control, and move faint Gaussians, if ``control`` has them due."""
     if control.is_due(iteration, progress):
         rasterizer.control_density(control.step_after(iteration, len(rasterizer), seed))
     if control.noise > 0 and iteration % NOISE_INTERVAL == 0 and progress < control.stop:
@@ -200,7 +200,7 @@ def control_density(
 
 
 def is_order_due(control: DensityControl, iteration: int, progress: float) -> bool:
-    """Return whether Gaussians added by ``control`` are sorted in after ``iteration``."""
+    """Return whether Gaussians are sorted along the curve again after ``iteration``."""
     return iteration % ORDER_INTERVAL == 0 and control.is_due(iteration, progress)
 
 

@@ -45,17 +45,17 @@ from rfcore.views import PointCloud, PosedPicture
 __all__ = ["SplatTrainer", "SplatTrainingConfig"]
 
 STATE_PARTS = ("gaussians", "first_moments", "second_moments")
-"""Of ``TrainingState``: each of them shaped as Gaussians."""
+"""Fields of ``TrainingState`` that have the shape of Gaussians."""
 
 
 @dataclass(frozen=True)
 class SplatTrainingConfig:
-    """How to train. ``threads`` and ``isa`` change how long it takes, nothing else."""
+    """Settings of a training run. ``threads`` and ``isa`` change only the time it takes."""
 
     gaussians: int = 150_000
-    """At most as many points are drawn from those given."""
+    """Most points that are drawn from those given."""
     sky: int = 0
-    """In how many directions, over the whole sphere, Gaussians at infinity are looked for."""
+    """Directions, over the whole sphere, in which Gaussians at infinity may be placed."""
     iterations: int = 2000
     initial_scale: float = 0.6
     """Standard deviation at the start, in units of the distance to the three nearest points."""
@@ -64,12 +64,12 @@ class SplatTrainingConfig:
     regularisation: Regularisation = field(default_factory=Regularisation)
     bands: Bands = field(default_factory=Bands)
     halved_until: float = 0.0
-    """Share of the run that looks at pictures of half the width and height: they cost less, and
-    are enough to put Gaussians in place (DashGaussian, Chen et al. 2025, with a fixed share)."""
+    """Share of the run with pictures of half the width and height, which cost less and are enough
+    to place Gaussians (DashGaussian, Chen et al. 2025, with a fixed share)."""
     antialiased: bool = False
-    """Train for the antialiased mode; the field says so."""
+    """Train for the antialiased mode; the field's metadata will say so."""
     exposure: bool = False
-    """Learn an affine map of colours per picture; the field is that of the mean picture."""
+    """Learn an affine map of colours per picture; the field shows the mean picture."""
     refine_poses: bool = False
     """Learn a correction of every picture's pose; the dataset's poses stay right on average."""
     threads: int = 1
@@ -128,7 +128,7 @@ class SplatTrainer(FieldTrainer):
 
     @property
     def primitives(self) -> int:
-        """How many Gaussians there are now."""
+        """The present number of Gaussians."""
         return len(self._rasterizer)
 
     def gaussians(self) -> Gaussians:
@@ -142,7 +142,7 @@ class SplatTrainer(FieldTrainer):
         return [self._poses.camera(view) for view in range(len(self._targets))]
 
     def pose_corrections(self) -> list[PoseCorrection]:
-        """Return how far each picture's pose was moved; none where poses are held."""
+        """Return how far each picture's pose was moved; empty if poses are not refined."""
         return [] if self._poses is None else self._poses.corrections(self._names)
 
     def field(
@@ -160,7 +160,7 @@ class SplatTrainer(FieldTrainer):
         return SplatField(self.gaussians(), metadata, threads=config.threads, isa=config.isa)
 
     def checkpoint(self) -> Checkpoint:
-        """Return what ``restore`` of a trainer made of the same things goes on from.
+        """Return the state for ``restore`` of a trainer with the same inputs.
 
         Raises ``TrainingDiverged`` when a parameter is no longer finite.
         """
@@ -228,7 +228,7 @@ class SplatTrainer(FieldTrainer):
         return loss
 
     def _target(self, view: int, progress: float) -> Target:
-        """Return what the picture ``view`` is to look like, in the size that is used now."""
+        """Return the target picture ``view`` in its present size."""
         return (self._halves if progress < self.config.halved_until else self._targets)[view]
 
     def _descend_with_pose(
@@ -277,7 +277,7 @@ class SplatTrainer(FieldTrainer):
 
 
 def _within(density: DensityControl, surfaces: Gaussians, *sky: Gaussians) -> Gaussians:
-    """Return all as one set; raise ``InvalidInput`` if it is larger than it may grow."""
+    """Return all as one set; raise ``InvalidInput`` if it exceeds the limit of growth."""
     start = joined(surfaces, *sky) if sky else surfaces
     if 0 < density.limit < len(start):
         beside = f", {len(sky[0])} of them sky" if sky else ""

@@ -4,8 +4,8 @@ Points come from the dataset, from depth maps, or are drawn at random along the 
 becomes one isotropic Gaussian, as wide as its neighbourhood (3DGS, section 5.1: the mean distance
 to the three nearest neighbours), half opaque, of the point's colour from every side.
 
-Points lie on surfaces. Clouds have none: the sky is Gaussians of their own, so far away that they
-stand still in every picture (``sky_gaussians``).
+Points lie on surfaces, but the sky has none. It gets Gaussians of its own, so far away that they do
+not move between pictures (``sky_gaussians``).
 
 Neighbours are found exactly, in a balanced k-d tree whose leaves hold at most ``LEAF_POINTS``
 points each: 120,000 points take 0.7 s of one core. Squared distances are float32 sums in the order
@@ -45,11 +45,11 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RandomStart:
-    """Where random points are put, along random pixels' rays.
+    """Placement of random points along the rays of random pixels.
 
     Distances are log-uniform between ``nearest`` and ``farthest`` times the distance at which the
-    cameras look, or, where their axes do not meet, the distance between cameras. A point counts
-    when ``seen_by`` cameras have it in view.
+    cameras look, or, if their axes do not meet, the distance between cameras. A point is kept if
+    ``seen_by`` cameras have it in view.
 
     Measured on the fox (docs/how-to/training.md): from 0.2 to 8 times with two cameras, and a tenth
     of the points at the farthest, held-out pictures reach 19.9 dB, with these values 26.2 dB;
@@ -180,7 +180,7 @@ MAX_SPACING_M = 20.0
 """A stray point far from all others would cover the picture."""
 LEAF_POINTS = 16
 QUERIES = 4096
-"""Points whose neighbours are looked for at a time: what they need stays in the cache."""
+"""Points whose neighbours are searched together; their data fits the cache."""
 
 
 def gaussians_from_points(
@@ -207,7 +207,7 @@ def gaussians_from_points(
 def _balls(
     means: F32, log_scales: F64, logit: float, rgb: NDArray[np.integer], sh_degree: int
 ) -> Gaussians:
-    """Return Gaussians that look alike from every side; ``rgb`` [N, 3] is 0..255."""
+    """Return isotropic Gaussians of one colour each; ``rgb`` [N, 3] is 0..255."""
     n = len(means)
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (rgb / 255.0 - 0.5) / SH_DC
@@ -221,28 +221,28 @@ def _balls(
 
 
 SKY_DISTANCE_M = 10 * SKY_M
-"""Beyond ``SKY_M`` in depth, too, wherever a picture of up to 168 degrees shows it."""
+"""Distance of the sky: its depth is beyond ``SKY_M`` in every picture of up to 168 degrees."""
 SKY_LOGIT = 2.0
 SKY_LEVELS = 15
-"""By how much, of 255, pictures differ that show the same piece of a cloud between its pixels."""
+"""Most difference, of 255, between pictures of the same piece of a cloud."""
 SKY_BASELINE = 0.1
-"""How far apart cameras have to be that agree, as a share of how far apart all are: at one place
-all agree about everything."""
+"""Least distance between agreeing cameras, as a share of the extent of all cameras: cameras at one
+place agree about everything."""
 DIRECTIONS = 4096
-"""Looked at together: what 1000 pictures show there is 25 MB."""
+"""Directions that are processed together; their colours in 1000 pictures take 25 MB."""
 NOT_SEEN = np.iinfo(np.int16).max
 
 
 def sky_gaussians(
     targets: Sequence[Target], directions: int, scale: float, *, sh_degree: int = 3
 ) -> Gaussians:
-    """Return Gaussians 100 km away in those of so many directions in which all look alike.
+    """Return Gaussians 100 km away in those of so many directions where pictures agree.
 
-    The directions are spread evenly over the sphere (Fibonacci lattice). One is kept where more
-    than half of the pictures that look there, from places apart, show the same colour: parallax
-    changes what is nearer, unless it has no texture, as a road has none. Such are kept as well, and
-    hidden by what lies before them. ``scale`` as in ``gaussians_from_points``, of the distance
-    between directions.
+    The directions are spread evenly over the sphere (Fibonacci lattice). A direction is kept if
+    more than half of the pictures that see it, from different places, show the same colour. Nearer
+    things change by parallax unless they have no texture, like a road; Gaussians behind those are
+    kept, too, but hidden. ``scale`` is the standard deviation in units of the distance between
+    directions.
     """
     centres_m = np.array([target.camera.world_from_cam.translation_m for target in targets])
     towards = _lattice(directions)
@@ -281,8 +281,8 @@ def _agreed_colour(
 
 
 def _extent_m(centres_m: F64, is_in: NDArray[np.bool_]) -> F64:
-    """Return the diagonal [D] of the box around those of the centres [V, 3] that ``is_in`` [V, D]
-    names; 0 around none."""
+    """Return the diagonal [D] of the box around the centres [V, 3] selected by ``is_in`` [V, D]; 0
+    if none is."""
     among = is_in[:, :, None]
     low = np.where(among, centres_m[:, None], np.inf).min(axis=0)
     high = np.where(among, centres_m[:, None], -np.inf).max(axis=0)
@@ -315,9 +315,10 @@ def spacing_m(xyz_m: F32) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class _KdTree:
-    """N points in L = 2^n leaves of m places; places left over hold a point at infinity.
+    """N points in L = 2^n leaves of m places; unused places hold a point at infinity.
 
-    ``points`` float32 [L, m, 3]; ``order`` [L m]: which point a place holds, from N on none.
+    ``points`` float32 [L, m, 3]; ``order`` [L m]: the index of the point in a place, N or more if
+    unused.
     ``boxes``: lowest and highest corner [2^l, 3] of the nodes of each level l, the root's first.
     """
 

@@ -1,7 +1,7 @@
-"""What every training run has, whatever it trains: iterations, a digest, metadata, divergence.
+"""The common part of all trainers: iterations, a digest, metadata, detection of divergence.
 
-A trainer of a kind of field is a ``FieldTrainer`` that says how one iteration is done and what its
-parameters are. How well a field shows pictures it was not trained on is measured here too.
+The trainer of a kind of field is a ``FieldTrainer`` that defines one iteration and its parameters.
+Quality on pictures that a field was not trained on is measured here too.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ __all__ = [
 ]
 
 WINDOW = 100
-"""Iterations whose mean loss is judged."""
+"""Iterations whose mean loss is compared."""
 TOLERATED_RISE = 1.5
 NOT_OF_THE_RESULT = ("threads", "isa")
-"""Settings that change how long a run takes, and no byte of the field."""
+"""Settings that change only the time of a run, and no byte of the field."""
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """What one iteration did: ``iteration`` counts from 1 to ``total``."""
+    """The result of one iteration; ``iteration`` counts from 1 to ``total``."""
 
     iteration: int
     total: int
@@ -65,8 +65,7 @@ class HeldOut:
 class FieldTrainer(ABC):
     """One training run, an iteration at a time.
 
-    ``training_digest`` is the SHA-256, in hex, of everything the result depends on; it is known
-    before the first iteration.
+    ``training_digest`` is the SHA-256, in hex, of everything that the result depends on.
     """
 
     kind: ClassVar[str]
@@ -75,14 +74,14 @@ class FieldTrainer(ABC):
     def __init__(self, iterations: int, training_digest: str) -> None:
         self.training_digest = training_digest
         self.total = iterations
-        """How many iterations the settings ask for."""
+        """Iterations of the whole run."""
         self.iteration = 0
-        """How many have been done."""
+        """Iterations done so far."""
         self._watch = DivergenceWatch()
 
     @property
     def finished(self) -> bool:
-        """Whether every iteration has been done."""
+        """True if every iteration has been done."""
         return self.iteration >= self.total
 
     def step(self, progress: float | None = None) -> TrainingProgress:
@@ -109,7 +108,7 @@ class FieldTrainer(ABC):
     @property
     @abstractmethod
     def primitives(self) -> int:
-        """How many Gaussians, or numbers of a hash grid, are being learned."""
+        """The number of Gaussians, or of numbers of a hash grid, being learned."""
 
     @abstractmethod
     def field(
@@ -123,7 +122,7 @@ class FieldTrainer(ABC):
 
     @abstractmethod
     def checkpoint(self) -> Checkpoint:
-        """Return what ``restore`` of a trainer made of the same things goes on from."""
+        """Return the state for ``restore`` of a trainer with the same inputs."""
 
     @abstractmethod
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -135,11 +134,11 @@ class FieldTrainer(ABC):
 
     @abstractmethod
     def _after_iteration(self, progress: float) -> None:
-        """Do what is done between two iterations, ``iteration`` of which are done."""
+        """Do the work between two iterations, of which ``iteration`` are done."""
 
     @abstractmethod
     def _parameters(self) -> Any:
-        """Return the groups of parameters, the arrays of a dataclass."""
+        """Return the groups of parameters as a dataclass of arrays."""
 
     def _metadata(
         self,
@@ -170,11 +169,11 @@ def settings_of(config: Any) -> list[tuple[str, Any]]:
 
 
 class DivergenceWatch:
-    """Notices that a run no longer gets anywhere.
+    """Detects that a run has diverged.
 
-    A run that learns has a falling mean loss over ``WINDOW`` iterations. One whose mean rises above
-    ``TOLERATED_RISE`` times its lowest, and above where it began, has diverged; the group of
-    parameters whose size grew most since the first window is named.
+    The mean loss over ``WINDOW`` iterations of a run that learns falls. If it rises above
+    ``TOLERATED_RISE`` times its lowest value, and above its first, the run has diverged; the error
+    names the group of parameters whose size grew most since the first window.
     """
 
     def __init__(self) -> None:
@@ -184,7 +183,7 @@ class DivergenceWatch:
         self._sizes: dict[str, float] = {}
 
     def see(self, iteration: int, loss: float, parameters: Callable[[], Any]) -> None:
-        """Take the loss of one iteration; raise ``TrainingDiverged`` if the run is lost."""
+        """Take the loss of one iteration; raise ``TrainingDiverged`` if the run has diverged."""
         if not math.isfinite(loss):
             raise TrainingDiverged(iteration, self._grown(parameters()), f"the loss is {loss}")
         self._sum += loss

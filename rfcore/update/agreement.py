@@ -1,12 +1,11 @@
-"""Which pixels of a frame the other passes contradict: what drove by is not learnt.
+"""Finds pixels that the other passes contradict, so that moving objects are not learnt.
 
-A block of 8x8 pixels counts as passing through when its frame is far from the field, and the other
-passes, at the same place of the street, are not: most of them, where the field's depth carries
-their blocks to. What persists over the passes (a parked car, another light) is far in all of them.
-Passes that nobody else saw have no one to contradict them; of one pass alone everything is learnt.
+A block of 8x8 pixels is moving if its frame differs from the field and most of the other passes,
+warped to the same place by the field's depth, do not. What persists over the passes (a parked car,
+another light) differs in all of them. Where there is only one pass, everything is learnt.
 
-A whole frame is an outlier (a wrong pose, a pasted picture) if its edges lie neither where the
-field's do nor where another vehicle saw some: edges stay in another light, colours do not.
+A whole frame is an outlier (a wrong pose, a pasted picture) if its edges agree neither with the
+field's nor with those of another vehicle: edges stay in another light, colours do not.
 """
 
 from __future__ import annotations
@@ -28,21 +27,21 @@ from rfcore.views import FieldView
 __all__ = ["both", "edge_correlation", "trusted_pixels", "without_outliers"]
 
 FAR_LEVELS = 20
-"""Mean absolute difference of a block's luma above which it does not show what the field does."""
+"""Mean absolute difference of a block's luma above which it does not show the same as the field."""
 NEAR_LEVELS = 12
 REACH_M = 6.0
-"""Two frames see the same place if their cameras are nearer than this and look the same way."""
+"""Two frames show the same place if their cameras are nearer than this and look the same way."""
 SAME_WAY = 0.8
 """Cosine of the angle between the axes of two such cameras."""
 UNKNOWN = 255
-"""Carried differences are below ``CLIPPED``; what the depth does not carry reads as this."""
+"""Level of pixels that cannot be warped; warped differences are at most ``CLIPPED``."""
 CLIPPED = 120
 EDGES_AGREE = 0.3
-"""Correlation of edges from which on two pictures show the same place. The sample street's pictures
-against its field: 0.70 to 0.98, in a third of the light, too, 0.16 to 0.38 if the pose is 0.5 m
-off, at most 0.21 for another picture of the same street."""
+"""Least correlation of edges of two pictures of the same place. Pictures of the sample street and
+its field have 0.70 to 0.98, also in a third of the light; 0.16 to 0.38 if the pose is 0.5 m off; at
+most 0.21 if the picture is another one of the same street."""
 EDGE_CELL_PX = 4
-"""Edges are those between means of so many pixels each way: noise and small pose errors go."""
+"""Edges are computed between means of so many pixels, which hides noise and small pose errors."""
 
 Mask = NDArray[np.bool_]
 F32 = NDArray[np.float32]
@@ -50,20 +49,20 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class _Difference:
-    """How far a frame is from the field: luma levels, uint8 [H, W], block by block."""
+    """The difference of a frame from the field: luma levels, uint8 [H, W], block by block."""
 
     view: FieldView
     levels: NDArray[np.uint8]
 
 
 def trusted_pixels(field: RadianceField, frames: Sequence[SeenFrame]) -> list[Mask | None]:
-    """Return for each frame which pixels [H, W] to learn from; None where all are."""
+    """Return for each frame the pixels [H, W] to learn from, or None for all."""
     differences = [_difference(field, frame) for frame in frames]
     return [_trusted(index, frames, differences) for index in range(len(frames))]
 
 
 def both(first: Sequence[Mask | None], second: Sequence[Mask | None]) -> list[Mask | None]:
-    """Return what is trusted by both, frame by frame."""
+    """Return the pixels that both trust, frame by frame."""
     pairs = zip(first, second, strict=True)
     return [b if a is None else a if b is None else a & b for a, b in pairs]
 
@@ -102,7 +101,7 @@ def _trusted(
 
 
 def _neighbours(index: int, frames: Sequence[SeenFrame]) -> Mapping[int, int]:
-    """Return the nearest frame of every other pass, by the pass's number."""
+    """Return the index of the nearest frame of every other pass, by the pass's number."""
     mine = frames[index]
     nearest: dict[int, tuple[float, int]] = {}
     position, axis = _position_and_axis(mine)
@@ -129,7 +128,7 @@ def _position_and_axis(
 
 
 def _carried(difference: _Difference, now: FieldView) -> NDArray[np.uint8]:
-    """Return the other frame's levels where ``now`` sees them, at most of each 3x3 blocks."""
+    """Return the other frame's levels warped to ``now``, the maximum over 3x3 blocks."""
     picture = I420.filled(now.render.size_px)
     blank = FieldView(now.camera, I420.filled(now.render.size_px, UNKNOWN), now.depth)
     levels = I420(difference.levels, picture.u, picture.v)
@@ -138,7 +137,7 @@ def _carried(difference: _Difference, now: FieldView) -> NDArray[np.uint8]:
 
 
 def _most_around(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the highest known level within a block's side; parallax moves what depth misses."""
+    """Return the highest known level within a block's side, which allows for wrong depth."""
     known = np.where(plane == UNKNOWN, 0, plane)
     most = known
     for axis in (0, 1):
@@ -148,9 +147,9 @@ def _most_around(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def without_outliers(field: RadianceField, passes: Sequence[Pass]) -> list[Pass]:
-    """Return the passes without frames that agree with neither the field nor another identity.
+    """Return the passes without frames that agree neither with the field nor with another vehicle.
 
-    A pass of which fewer than half the frames, or fewer than an update needs, agree is left out.
+    A pass is left out if fewer than half of its frames agree, or fewer than an update needs.
     Raises ``DatasetError`` for a picture that cannot be read.
     """
     identities = sorted({drive.identity for drive in passes})
@@ -184,7 +183,7 @@ def _edges(plane: F32) -> NDArray[np.float64]:
 
 
 def _agreeing(field: RadianceField, frames: Sequence[SeenFrame]) -> list[bool]:
-    """Tell of each frame, its ``pass_number`` that of its identity, whether it is no outlier."""
+    """Return for each frame, whose ``pass_number`` is that of its vehicle, whether it agrees."""
     views = [render_field_view(field, frame.camera) for frame in frames]
     pictures = [i420_from_rgb(frame.rgb) for frame in frames]
     agree = [

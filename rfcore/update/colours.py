@@ -1,13 +1,13 @@
-"""A colour layer fitted to what passes saw: another light on the shape that is there.
+"""Fits a colour layer to passes: another light on the field's shape.
 
-Voxels first, coarse to fine, then what single splats add: shrinking a finished fit ruins it. A
-frame's error is gathered by the weights with which splats make up its pixels, which the backward
-pass of a grey field counts, so that a splat that is black now gathers as any other; each round is a
-weighted least squares for every voxel at once (SIRT, Gilbert 1972), for single splats with
-Nesterov's momentum.
+Voxels are fitted first, coarse to fine, then single splats, because reducing a finished fit to
+fewer numbers ruins it. A frame's error is distributed to splats by their blending weights. The
+backward pass of a grey field computes these, so that black splats are treated like any other. Each
+round is a weighted least squares for every voxel at once (SIRT, Gilbert 1972), for single splats
+with Nesterov's momentum.
 
-Of two passes that disagree the layer is the mean, so pixels that the others contradict are left out
-(``rfcore.update.agreement``).
+Where two passes disagree the layer would be their mean, so pixels that the others contradict are
+left out (``rfcore.update.agreement``).
 """
 
 from __future__ import annotations
@@ -49,33 +49,32 @@ __all__ = ["ColourFit", "colour_layer"]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 FINEST_VOXELS, OTHER_VOXELS = (16.0, 3), (0.25, 1)
-"""Pixels that a voxel makes up, from which on it has a colour of its own, and in how many of the
-format's steps it is coded. Most bytes are the finest voxels': from 0.25 pixels on and in single
-steps the voxels of the yardstick street take 141 kB at dusk, from 4 pixels on and in triple steps
-88 kB for 0.1 dB less."""
+"""The weight in pixels above which a voxel gets a colour, and its step in units of the format's.
+The finest voxels take most bytes: from 0.25 pixels on and in single steps the voxels of the
+benchmark street take 141 kB at dusk, from 4 pixels on and in triple steps 88 kB for 0.1 dB less."""
 OWN_WEIGHTS = (4.0, 16.0, 64.0)
-"""Of single splats: below the first it has none, then in steps of 4, 2 and 1 times ``OWN_COARSER``
-of the format's."""
+"""Weights of single splats in pixels. Below the first a splat gets no colour of its own; above
+these it is coded in 4, 2 and 1 times ``OWN_COARSER`` steps of the format."""
 OWN_COARSER = 2
 DEAD_ZONE = 0.1
-"""Added before rounding down, so that a step is taken from 0.6 of it on."""
+"""Values are rounded towards 0: a step is taken from 0.5 plus this on."""
 ALL_BANDS = 64
 BANDS = 32
-"""Higher bands of the colour are halved: of the yardstick street at dusk the squared error is 1.6 %
-below that with all of them and 2.4 % below that without."""
+"""Higher bands of the colour are halved: the squared error of the benchmark street at dusk is then
+1.6 % below that with full bands and 2.4 % below that without bands."""
 OUTLINE_ROUNDS = 2
 SLOPE_RIDGE = 0.075
-"""Of the ridge on offsets: variances of luma are smaller than its weights."""
+"""Ridge on slopes as a share of that on offsets, since variances of luma are small."""
 
 
 @dataclass(frozen=True)
 class ColourFit:
-    """How to fit a layer. ``threads`` changes how long it takes, nothing else."""
+    """Settings of the fit of a layer. ``threads`` changes only the time it takes."""
 
     voxel_rounds: int = 8
     own_rounds: int = 12
     ridge: float = 8.0
-    """Pixels' worth of pull towards no change, of a voxel."""
+    """Weight of no change for a voxel, in pixels."""
     own_ridge: float = 1.0
     threads: int = 1
 
@@ -111,7 +110,7 @@ def _field(base: SplatField, layer: ColourLayer) -> SplatField:
 
 
 class _Fit:
-    """What all rounds share: frames, voxels, weights."""
+    """The state of a fit: frames, voxels, weights."""
 
     def __init__(
         self,
@@ -134,27 +133,27 @@ class _Fit:
         self._weights = self._gathered_weights()
 
     def trust(self, field: SplatField) -> None:
-        """Leave out from now on what only single passes show, ``field`` being what all do."""
+        """Exclude from now on pixels that only single passes show, compared with ``field``."""
         for number, trusted in enumerate(trusted_pixels(field, self._frames)):
             if trusted is not None:
                 self._trusted[number] *= trusted
         self._weights = self._gathered_weights()
 
     def layer(self) -> ColourLayer:
-        """Return the layer fitted to what is trusted."""
+        """Return the layer fitted to the trusted pixels."""
         voxels = self._with_voxels(self._voxel_numbers, self._config.voxel_rounds)
         nothing = np.zeros((self._base.primitives, 3), np.int32)
         start = ColourLayer(self._quantised_voxels(voxels), nothing, BANDS)
         return replace(start, own=self._quantised_own(self._own(start)))
 
     def outline(self) -> ColourLayer:
-        """Return a layer of voxels alone, from which ``layer`` then goes on."""
+        """Return a layer of voxels only, from which ``layer`` then continues."""
         self._voxel_numbers = self._with_voxels(self._voxel_numbers, OUTLINE_ROUNDS)
         nothing = np.zeros((self._base.primitives, 3), np.int32)
         return ColourLayer(self._quantised_voxels(self._voxel_numbers), nothing, BANDS)
 
     def _with_voxels(self, voxels: Sequence[F64], rounds: int) -> list[F64]:
-        """Return the coefficients [V, 6] of every size of voxel after so many more rounds."""
+        """Return the coefficients [V, 6] for every size of voxel after so many more rounds."""
         base = self._base.gaussians
         voxels = [part.copy() for part in voxels]
         for _ in range(rounds):
@@ -165,7 +164,7 @@ class _Fit:
         return voxels
 
     def _solve(self, left: F64, voxels: Sequence[F64]) -> None:
-        """Add to every voxel, coarse to fine, what explains most of ``left`` [N, 3]."""
+        """Add to every voxel, coarse to fine, the least squares solution for ``left`` [N, 3]."""
         weights, slope_of, ridge = self._weights, self._slope_of, self._config.ridge
         for (voxel, count), part in reversed(list(zip(self._voxels, voxels, strict=True))):
             weight = np.bincount(voxel, weights, count)
@@ -192,7 +191,7 @@ class _Fit:
         return tuple(out)
 
     def _own(self, start: ColourLayer) -> F64:
-        """Return what single splats add to ``start`` [N, 3], in red, green, blue."""
+        """Return the colours that single splats add to ``start`` [N, 3], in red, green, blue."""
         lit = layered_colours(self._base.gaussians, start)
         own = np.zeros((len(lit), 3))
         before, momentum, ridge = own.copy(), 1.0, self._config.own_ridge
@@ -207,7 +206,7 @@ class _Fit:
         return before
 
     def _quantised_own(self, own: F64) -> NDArray[np.int32]:
-        """Return whole numbers, coarser where little is seen."""
+        """Return integers, in coarser steps for splats that are hardly seen."""
         least, some, much = OWN_WEIGHTS
         weights = self._weights
         scale = np.where(weights > much, 1.0, np.where(weights > some, 2.0, 4.0))[:, None]
@@ -216,7 +215,7 @@ class _Fit:
         return np.where(weights[:, None] > least, np.clip(whole, -127, 127), 0).astype(np.int32)
 
     def _gathered(self, gaussians: Gaussians) -> F64:
-        """Return the frames' errors by splat [N, 3]."""
+        """Return the frames' errors distributed to splats [N, 3]."""
         self._tell()
         rasterizer = Rasterizer(
             gaussians,
@@ -238,7 +237,7 @@ class _Fit:
         return weights
 
     def _backward(self, camera: Camera, picture: F32) -> F64:
-        """Return how much of ``picture`` falls on each splat [N, 3], by its weights."""
+        """Return ``picture`` distributed to splats [N, 3] by their blending weights."""
         self._grey.forward(camera)
         self._grey.backward(np.ascontiguousarray(picture, np.float32))
         return self._grey.gradients()["sh"][:, 0].astype(np.float64) / SH_DC
@@ -263,7 +262,7 @@ def _whole(numbers: F64) -> F64:
 
 
 def _grey(gaussians: Gaussians) -> Gaussians:
-    """Return the same splats, all of one grey: no gradient is held back at black."""
+    """Return the same splats, all of one grey, so that no gradient is clamped at black."""
     return replace(gaussians, sh=np.zeros((len(gaussians), 1, 3), np.float32))
 
 

@@ -23,8 +23,8 @@ __all__ = ["LearnAs", "Update", "UpdateSettings", "learn", "learn_from"]
 
 
 class LearnAs(StrEnum):
-    """What an update makes: another field; the same, stored as its difference to the base
-    (``rfcore.field.delta``); or the colours of one light on the same field."""
+    """The result of an update: another field; another field stored as its difference to the base
+    (``rfcore.field.delta``); or a colour layer of one light on the base."""
 
     ALL = "all"
     DELTA = "delta"
@@ -33,17 +33,17 @@ class LearnAs(StrEnum):
 
 @dataclass(frozen=True)
 class UpdateSettings:
-    """How an update is made and judged."""
+    """Settings of an update and of its acceptance."""
 
     learn_as: LearnAs = LearnAs.ALL
     frames: int = 48
     """Most frames taken from all passes."""
     min_identities: int = 2
-    """From fewer vehicles nothing is learnt."""
+    """Fewest vehicles to learn from."""
     min_saved_percent: float = 2.0
-    """Bits must fall by so much on the frames held back."""
+    """Least mean saving of bits on the frames held back."""
     max_loss_percent: float = 2.0
-    """For no pass may bits rise by more."""
+    """Most rise of bits for any pass."""
     fine_tuning: FineTuning = field(default_factory=FineTuning)
     colours: ColourFit = field(default_factory=ColourFit)
 
@@ -56,15 +56,15 @@ class UpdateSettings:
 
 @dataclass(frozen=True)
 class Update:
-    """What was learnt, and by how many percent fewer bits each pass then takes."""
+    """The learnt field, and the percentage of bits that it saves for each pass."""
 
     learnt: SplatField
     saved_percent: dict[str, float]
     frames: int
     refused: str = ""
-    """Why it is not to be kept; empty if it is."""
+    """The reason why it is not to be kept; empty if it is."""
     dropped: dict[str, int] = field(default_factory=dict)
-    """Frames of each identity that were outliers and taught nothing."""
+    """Frames of each vehicle that were left out as outliers."""
 
     @property
     def mean_saved_percent(self) -> float:
@@ -78,9 +78,9 @@ def learn(
     settings: UpdateSettings,
     progress: Progress | None = None,
 ) -> Update:
-    """Return what ``passes``, of one light, teach about ``base`` without their outliers.
+    """Update ``base`` by ``passes`` of one light, without their outliers.
 
-    Raises as ``learn_from`` does, saying how many frames were dropped where too few are left.
+    Raises as ``learn_from``; if too few frames are left, the error says how many were dropped.
     """
     check_passes(passes, settings.min_identities)
     honest = without_outliers(base, passes)
@@ -103,10 +103,10 @@ def learn_from(
     settings: UpdateSettings,
     progress: Progress | None = None,
 ) -> Update:
-    """Return what ``passes``, of one light, teach about ``base``, and whether it pays.
+    """Update ``base`` by ``passes`` of one light, and test whether it saves bits.
 
-    Outliers are not looked for. Raises ``InvalidInput`` for a field that is no splats, or passes of
-    too few vehicles or frames, ``DatasetError`` for a picture that cannot be read.
+    Outliers are not removed. Raises ``InvalidInput`` for a field that is not of splats, or passes
+    of too few vehicles or frames, ``DatasetError`` for a picture that cannot be read.
     """
     if not isinstance(base, SplatField):
         raise InvalidInput("field", f"{base.metadata.kind} cannot be updated, only splats")
@@ -139,7 +139,8 @@ def _made(
     settings: UpdateSettings,
     progress: Progress | None,
 ) -> SplatField:
-    """Return what is learnt of ``base``, or of the field that it is itself a delta or layer of."""
+    """Return the field learnt from ``base``; a delta is made on the base of ``base``, if it has
+    one."""
     if settings.learn_as is LearnAs.COLOURS:
         return colour_layer(base, frames, settings.colours, progress)
     as_delta, root = settings.learn_as is LearnAs.DELTA, base.base or base

@@ -1,10 +1,11 @@
-"""All parameters of a splat field fine-tuned to what passes saw.
+"""Fine-tunes all parameters of a splat field to passes.
 
-Stochastic descent on L1 and D-SSIM, one frame an iteration, from the field as it is. L1 makes every
-splat the median of what it is shown, so what most passes saw wins; pixels that the other passes
-contradict (``rfcore.update.agreement``) are left out: by the field as it was, which decides between
-two passes in its own light, and half-way by what was learnt until then, in another light. Density
-control splits Gaussians where the gradient stays large, and takes away those that have faded.
+Stochastic descent on L1 and D-SSIM, one frame an iteration, starts from the present field. L1 leads
+every splat to the median of its observations, so the majority of passes wins. Pixels that the other
+passes contradict (``rfcore.update.agreement``) are left out: at first compared with the present
+field, which decides between two passes in its own light, and from half-way on compared with what
+was learnt until then, for another light. Density control splits Gaussians where the gradient stays
+large, and removes faded ones.
 """
 
 from __future__ import annotations
@@ -27,33 +28,34 @@ from rfcore.update.passes import SeenFrame
 __all__ = ["FineTuning", "Progress", "fine_tuned"]
 
 Progress = Callable[[str, int, int], None]
-"""Told what is being done, how much of it is done, and how much there is."""
+"""Called with the present task, how much of it is done, and how much there is."""
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class FineTuning:
-    """How to fine-tune. ``threads`` changes how long it takes, nothing else.
+    """Settings of fine-tuning. ``threads`` changes only the time it takes.
 
-    Rates measured on the yardstick street's dusk drive, 18 of 24 frames learnt, 6 held back, with
-    the field of noon (12.4 dB): colours at 5e-3 reach 20.3 dB in 300 iterations, at 2e-2 25.8, at
-    4e-2 28.0; 600 iterations 28.6 dB, 34 s of one core.
+    Rates were measured on the benchmark street's dusk drive, 18 of 24 frames learnt, 6 held back,
+    with the field of noon (12.4 dB): colours at 5e-3 reach 20.3 dB in 300 iterations, at 2e-2 25.8,
+    at 4e-2 28.0; 600 iterations 28.6 dB, 34 s of one core.
     """
 
     iterations: int = 600
     means: float = 2e-3
-    """Metres a step."""
+    """Rate of the means in metres a step."""
     log_scales: float = 5e-3
     quaternions: float = 1e-3
     opacity: float = 2e-2
     sh_dc: float = 4e-2
     sh_rest: float = 1e-3
     final_factor: float = 0.05
-    """What is left of the rates at the end; they fall all along."""
+    """Factor on the rates at the end; they fall exponentially."""
     growth: float = 0.02
-    """Of the Gaussians, how many more there may be in the end."""
+    """Most growth of the number of Gaussians, as a share."""
     level_iterations: int = 60
-    """Of fitting each lower level of detail anew, where the field has some; 0 leaves prefixes."""
+    """Iterations of fitting each lower level of detail, if the field has some; 0 leaves
+    prefixes."""
     seed: int = 0
     threads: int = 1
 
@@ -94,8 +96,8 @@ def fine_tuned(
 ) -> SplatField:
     """Return another field with all parameters fine-tuned to ``frames``, uncompressed.
 
-    Its splats are in order of importance, or, to ``keep_order``, in the field's with those that
-    were added behind them: then every level of detail draws the splats that it drew before. Raises
+    Its splats are in order of importance. With ``keep_order`` they stay in the field's order, with
+    added ones at the end, so that every level of detail draws the same splats as before. Raises
     ``InvalidInput`` without frames or splats.
     """
     if not frames or not field.primitives:
@@ -112,7 +114,7 @@ def fine_tuned(
 
 
 class _Descent:
-    """A field on its way: ``step`` by ``step``."""
+    """The state of fine-tuning."""
 
     def __init__(self, field: SplatField, frames: Sequence[SeenFrame], config: FineTuning) -> None:
         self._start, self._frames, self._config = field, frames, config
@@ -126,12 +128,12 @@ class _Descent:
         self._rasterizer.keep_scores(config.growth > 0)
 
     def trust(self) -> None:
-        """Leave out from now on what only single passes show."""
+        """Exclude from now on pixels that only single passes show."""
         if len({frame.pass_number for frame in self._frames}) > 1:
             self._trusted = both(self._trusted, trusted_pixels(self.field(), self._frames))
 
     def step(self, iteration: int) -> None:
-        """Do one iteration and what follows it."""
+        """Do one iteration and density control."""
         number, config = next(self._order), self._config
         progress = iteration / config.iterations
         camera, rates = self._frames[number].camera, config.rates(progress)
@@ -147,7 +149,7 @@ class _Descent:
         control_density(rasterizer, self._density, iteration + 1, progress, config.seed)
 
     def field(self) -> SplatField:
-        """Return the field as it is now."""
+        """Return the present field."""
         metadata = replace(
             self._start.metadata, training_digest="", held_out_psnr_db=None, held_out_ssim=None
         )
@@ -163,7 +165,7 @@ def _finished(
     has_levels: bool,
     keep_order: bool,
 ) -> SplatField:
-    """Return the field with its splats in their order and its levels of detail."""
+    """Return the field with ordered splats and its levels of detail."""
     cameras = [frame.camera for frame in frames]
     if has_levels and config.level_iterations:
         levels = LevelFitConfig(iterations=config.level_iterations, threads=config.threads)

@@ -1,7 +1,7 @@
-"""What frames cost against a field: bits at equal quality, coded as a vehicle codes them.
+"""Measures the bits of frames coded against a field, to compare fields at equal quality.
 
-The frames of a pass are coded in their order at several rates, with the references and the change
-of light that the encoder chooses by itself, and log(rate) is interpolated over luma PSNR.
+The frames of a pass are coded in their order at several CRFs, with the references and the light
+that the encoder chooses, as on a vehicle. The logarithm of the rate is interpolated over luma PSNR.
 """
 
 from __future__ import annotations
@@ -25,44 +25,45 @@ __all__ = ["TRIAL_CRFS", "Trial", "saved_percent", "try_field"]
 
 TRIAL_CRFS = (22.0, 28.0, 34.0)
 HEADER_BYTES = 100
-"""Of a packet that carries nothing but its pose, about: no saving is infinite."""
+"""Approximate size of a packet with only its pose; without it a saving could be infinite."""
 LEAST_ERROR = 0.05
-"""Squared levels: better than 61 dB is as good."""
+"""Least squared error in levels: a PSNR above 61 dB counts as 61 dB."""
 EPOCH = 1
 Point = tuple[float, float]
-"""Luma PSNR, dB, and bytes a frame."""
-Told = Callable[[], None]
+"""Luma PSNR in dB, and bytes a frame."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What the frames of each pass cost, by the pass's number: ascending in quality."""
+    """Rate and quality of the frames of each pass, by its number, ascending in quality."""
 
     points: Mapping[int, tuple[Point, ...]]
 
 
 def try_field(
-    field: RadianceField, frames: Sequence[SeenFrame], told: Told = lambda: None
+    field: RadianceField, frames: Sequence[SeenFrame], progress: Callable[[], None] = lambda: None
 ) -> Trial:
     """Code ``frames`` against ``field``; raise ``InvalidInput`` if there are none.
 
-    ``told`` is called before each frame is coded, at each rate.
+    ``progress`` is called before each frame is coded, at each CRF.
     """
     if not frames:
         raise InvalidInput("trial", "no frames are held back: give more")
     by_pass = groupby(frames, lambda frame: frame.pass_number)
-    return Trial({number: _points(field, list(of_pass), told) for number, of_pass in by_pass})
+    return Trial({number: _points(field, list(of_pass), progress) for number, of_pass in by_pass})
 
 
 def saved_percent(before: Trial, after: Trial) -> dict[int, float]:
-    """Return by how many percent fewer bytes each pass takes after than before; below 0: more."""
+    """Return the percentage of bytes that each pass saves; negative if it takes more."""
     return {
         number: 100 * (1 - math.exp(_log_ratio(before.points[number], after.points[number])))
         for number in before.points
     }
 
 
-def _points(field: RadianceField, frames: Sequence[SeenFrame], told: Told) -> tuple[Point, ...]:
+def _points(
+    field: RadianceField, frames: Sequence[SeenFrame], progress: Callable[[], None]
+) -> tuple[Point, ...]:
     views = [render_field_view(field, frame.camera) for frame in frames]
     pictures = [i420_from_rgb(frame.rgb) for frame in frames]
     points = []
@@ -70,7 +71,7 @@ def _points(field: RadianceField, frames: Sequence[SeenFrame], told: Told) -> tu
         encoder = DeltaEncoder(CodecConfig(*pictures[0].size_px, crf=crf))
         state, size_bytes, errors = encoder.start(EPOCH), 0, []
         for picture, view in zip(pictures, views, strict=True):
-            told()
+            progress()
             coded = encoder.encode(state, picture, view)
             state = coded.state
             size_bytes += len(coded.packet.payload) + len(coded.packet.light)
@@ -82,7 +83,7 @@ def _points(field: RadianceField, frames: Sequence[SeenFrame], told: Told) -> tu
 
 
 def _log_ratio(before: Sequence[Point], after: Sequence[Point]) -> float:
-    """Return log(after / before) in the middle of the qualities that both reach."""
+    """Return log(after / before) at the middle of the range of quality that both reach."""
     low = max(before[0][0], after[0][0])
     high = min(before[-1][0], after[-1][0])
     quality_db = (low + high) / 2
@@ -90,6 +91,6 @@ def _log_ratio(before: Sequence[Point], after: Sequence[Point]) -> float:
 
 
 def _log_rate(points: Sequence[Point], quality_db: float) -> float:
-    """Interpolate log(rate) linearly; what lies beyond the points is as the outermost."""
+    """Interpolate log(rate) linearly; beyond the points it is constant."""
     qualities_db, rates = zip(*points, strict=True)
     return float(np.interp(quality_db, qualities_db, np.log(rates)))

@@ -1,9 +1,9 @@
 """The forward renderer on OpenCL devices: the bytes of the native kernels, or no picture at all.
 
-``device`` finds and builds, ``renderer`` draws and carries pictures from pose to pose,
-``self_check`` proves a device before it is opened. Everything that decides a byte stands in the
+``device`` finds devices and builds the program, ``renderer`` draws pictures and warps them to other
+poses, ``self_check`` tests a device before it is used. Everything that decides a byte is in the
 ``.cl`` files, which follow ``rfcore/csrc/raster`` and ``rfcore/csrc/picture`` operation by
-operation; the host only counts.
+operation; the host computes only sizes.
 """
 
 from rfcore.raster.opencl.device import Device, DeviceFull, DeviceLost, LentBuffer

@@ -36,17 +36,17 @@ SOURCES = (
     "warp.cl",
 )
 LEAST_BYTES = 64
-"""Of a buffer: there are none of nothing."""
+"""Smallest buffer: OpenCL has no empty ones."""
 MOST_RETURNED = 8
-"""Buffers that were lent and are kept for the next loan."""
+"""Returned buffers that are kept for reuse."""
 
 
 class DeviceLost(Exception):
-    """The device failed while it drew; what it had drawn is not to be shown."""
+    """The device failed while drawing; the picture must not be used."""
 
 
 class DeviceFull(Exception):
-    """One picture takes more memory than is kept for one; others do not."""
+    """This picture takes more memory than is reserved for one; others may not."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ BUILDS = (
     Build("plain", ("-cl-fp32-correctly-rounded-divide-sqrt",)),
     Build("guarded", ("-DUNFUSED_PRODUCTS", "-DINTEGER_DIVISION")),
 )
-"""In the order in which they are tried: the second for compilers that contract all the same and
-devices whose division is not correctly rounded."""
+"""Builds in the order in which they are tried. The second is for compilers that contract all the
+same and devices whose division is not correctly rounded."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """A device whose program is built; not yet one whose pictures may be believed."""
+    """A device whose program is built, but not yet tested."""
 
     name: str
     driver: str
@@ -114,9 +114,9 @@ def _devices() -> list[Any]:
 
 
 def build_device(device: Any, build: Build) -> Device:
-    """Compile the kernels; raise ``BackendUnavailable`` with the compiler's words if it cannot.
+    """Compile the kernels; raise ``BackendUnavailable`` with the compiler's message if it fails.
 
-    What it says of kernels that it compiled goes to the log.
+    Warnings of the compiler are logged.
     """
     try:
         context = cl.Context([device])
@@ -142,7 +142,7 @@ def _source() -> str:
 
 
 class LentBuffer:
-    """A buffer that its memory does not use while this is referred to, from any thread."""
+    """A buffer that stays unchanged while this object is referred to, by any thread."""
 
     def __init__(self, buffer: Any, returned: deque[Any]) -> None:
         self.buffer = buffer
@@ -150,12 +150,12 @@ class LentBuffer:
 
     @property
     def size_bytes(self) -> int:
-        """What it takes on the device."""
+        """The buffer's size on the device."""
         return int(self.buffer.size)
 
 
 class DeviceMemory:
-    """Buffers by name. They grow by half when they must, and are kept from picture to picture."""
+    """Buffers by name, which grow by half when needed and are reused for the next picture."""
 
     def __init__(self, device: Device) -> None:
         self._context = device.context
@@ -166,7 +166,7 @@ class DeviceMemory:
         return self._buffers[name]
 
     def at_least(self, name: str, size_bytes: int) -> None:
-        """Make room for ``size_bytes``; what a buffer held is lost when it grows."""
+        """Make room for ``size_bytes``; a buffer that grows loses its content."""
         before = self._buffers.get(name)
         if before is not None and before.size >= size_bytes:
             return
@@ -176,12 +176,12 @@ class DeviceMemory:
             before.release()
 
     def lend(self, name: str, size_bytes: int) -> LentBuffer:
-        """Take out a buffer of ``size_bytes``: what its name stands for next is another one."""
+        """Remove a buffer of ``size_bytes`` from this memory; its name will get another one."""
         self.at_least(name, size_bytes)
         return LentBuffer(self._buffers.pop(name), self._returned)
 
     def _buffer(self, size_bytes: int) -> Any:
-        """Return a buffer that was lent and came back, or a new one."""
+        """Return a returned buffer of this size, or a new one."""
         for _ in range(len(self._returned)):
             returned = self._returned.popleft()
             if returned.size == size_bytes:

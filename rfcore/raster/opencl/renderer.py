@@ -1,13 +1,13 @@
-"""One set of Gaussians in a device's memory, the kernels that draw them, and what they drew.
+"""One set of Gaussians in a device's memory, the kernels that draw them, and drawn planes.
 
 A picture is projected, its visible Gaussians gathered and sorted by depth, their overlaps with
 tiles written down and sorted by tile, and every tile blended. Both sorts are stable, so that ties
 stay in the order of the Gaussians. Two numbers come back in between: how many are visible, and how
 many overlaps there are.
 
-Of a codec's picture, depth and opacity stay on the device until somebody asks for them
-(``DrawnPlane``), for what warps and corrections take is there already: depths, and the pictures
-that were drawn or uploaded before. They make room, the oldest first, when they take too much of it.
+Depth and opacity of a codec's picture stay on the device until the first request
+(``DrawnPlane``), so that warps and corrections find their inputs there: depths, and pictures that
+were drawn or uploaded before. When planes take too much memory, the oldest are moved to the CPU.
 """
 
 from __future__ import annotations
@@ -54,10 +54,9 @@ MAX_GROUP_ENTRIES = 1 << 28
 MAX_TILE_ENTRIES = 1 << 26
 """Overlaps of Gaussians and tiles that memory is kept for, 16 bytes each: 1 GiB."""
 MOST_HELD_BYTES = 1 << 28
-"""Depths and opacities of one rasterizer's pictures that stay on the device: 32 planes of
-1920x1080. Beyond it the oldest come back to the CPU."""
+"""Most bytes of planes of one rasterizer that stay on the device: 32 planes of 1920x1080."""
 MOST_PICTURES = 32
-"""Pictures that are kept on the device beside the CPU's, of one rasterizer."""
+"""Pictures of one rasterizer that are also kept on the device."""
 SPLAT_BYTES, BOX_BYTES, PREPARED_BYTES, CAMERA_BYTES = 64, 12, 40, 84
 PLACE_BYTES = 8
 SIDE = 64
@@ -69,12 +68,12 @@ U32 = np.uint32
 I32 = np.int32
 NOTHING = np.zeros(1, U32)
 ZERO = U32(0)
-"""Known to the kernels at run time alone (``PRODUCT`` in arithmetic.cl)."""
+"""A zero that kernels get only at run time (``PRODUCT`` in arithmetic.cl)."""
 
 
 class DrawnPlane:
-    """Depth or opacity, float32 [H, W], of a picture: ``lent`` while it is on ``device``, ``array``
-    once it is with the CPU; at first on the device alone."""
+    """Depth or opacity of a picture, float32 [H, W]: ``lent`` is its buffer while ``device`` holds
+    it, ``array`` its copy on the CPU, if there is one."""
 
     def __init__(self, device: Device, lent: LentBuffer, shape: tuple[int, int]) -> None:
         self.device, self.shape = device, shape
@@ -84,7 +83,7 @@ class DrawnPlane:
 
 @dataclass(frozen=True, eq=False)
 class DeviceWarp:
-    """What a warp is made of, or with ``minus`` a correction (``rfcore.native.warp``).
+    """The inputs of a warp, or with ``minus`` of a correction (``rfcore.native.warp``).
 
     ``previous`` was taken at ``before``; the depths are buffers of the device.
     """
@@ -98,12 +97,12 @@ class DeviceWarp:
 
     @property
     def numbers(self) -> Sequence[float]:
-        """Those of ``warp_numbers``."""
+        """The numbers of ``warp_numbers``."""
         return warp_numbers(self.before.camera, self.now.camera)
 
     @property
     def doubt(self) -> int:
-        """Levels that a difference is not trusted by."""
+        """Levels by which a difference is reduced."""
         return 0 if self.minus is None else CORRECTION_DOUBT
 
 
@@ -175,7 +174,7 @@ class DeviceRasterizer:
     ) -> tuple[DrawnPlane, DrawnPlane]:
         """Write the colours as the codec's picture; return depth and opacity.
 
-        Of the 20 bytes a pixel of ``draw`` 1.5 come back. Raises as ``draw`` does.
+        It copies 1.5 bytes a pixel from the device instead of 20. Raises as ``draw``.
         """
         with _lost_if_it_fails(self.device):
             self._draw(camera, degree)
@@ -188,13 +187,13 @@ class DeviceRasterizer:
             return self._hold("depth", shape), self._hold("opacity", shape)
 
     def hold(self, plane: F32) -> DrawnPlane:
-        """Return a plane [H, W] of the CPU's as if it were drawn here."""
+        """Upload a plane [H, W] of the CPU."""
         with _lost_if_it_fails(self.device):
             self._fill("depth", plane)
             return self._hold("depth", plane.shape)
 
     def fetch(self, plane: DrawnPlane) -> F32:
-        """Return a plane as the CPU's array, copied once; it stays on the device, too."""
+        """Return a plane as an array on the CPU; it stays on the device, too."""
         with _lost_if_it_fails(self.device):
             if plane.array is None:
                 assert plane.lent is not None
@@ -204,7 +203,7 @@ class DeviceRasterizer:
             return plane.array
 
     def carry(self, warp: DeviceWarp, out: I420) -> None:
-        """Write what ``warp_i420`` or, with ``minus``, ``correct_i420`` make."""
+        """Write the result of ``warp_i420`` or, with ``minus``, of ``correct_i420``."""
         memory, pixels, names = self._memory, out.y.size, ("warp", "filter", "places")
         with _lost_if_it_fails(self.device):
             minus = warp.previous if warp.minus is None else warp.minus
@@ -229,14 +228,14 @@ class DeviceRasterizer:
         self._blend(camera)
 
     def _fetch(self, *wanted: tuple[str, F32 | None]) -> None:
-        """Copy buffers to where they are wanted, and wait for all of it."""
+        """Copy buffers to arrays, and wait for the copies."""
         for name, out in wanted:
             if out is not None:
                 cl.enqueue_copy(self._queue, out, self._memory[name], is_blocking=False)
         self._queue.finish()
 
     def _fetch_picture(self, name: str, out: I420) -> None:
-        """Copy a buffer to the planes of ``out``, and wait for that."""
+        """Copy a buffer to the planes of ``out``, and wait for the copies."""
         start, made = 0, self._memory[name]
         for plane in out.planes:
             cl.enqueue_copy(self._queue, plane, made, src_offset=start, is_blocking=False)
@@ -248,7 +247,7 @@ class DeviceRasterizer:
         cl.enqueue_copy(self._queue, self._memory[name], np.ascontiguousarray(values))
 
     def _hold(self, name: str, shape: tuple[int, int]) -> DrawnPlane:
-        """Return what a buffer holds as a plane that the next picture leaves alone."""
+        """Return a buffer's content as a plane that the next picture does not overwrite."""
         lent = self._memory.lend(name, 4 * shape[0] * shape[1])
         plane = DrawnPlane(self.device, lent, shape)
         self._held.append(ref(plane))
@@ -256,7 +255,7 @@ class DeviceRasterizer:
         return plane
 
     def _make_room(self) -> None:
-        """Have the planes that are held longest come back to the CPU while all take too much."""
+        """Move the oldest planes to the CPU while all of them take too much memory."""
         held = [plane for each in self._held if (plane := each()) and plane.lent is not None]
         sizes = [plane.lent.size_bytes for plane in held if plane.lent is not None]
         while len(held) > 1 and sum(sizes) > MOST_HELD_BYTES:
@@ -266,7 +265,7 @@ class DeviceRasterizer:
         self._held = [ref(plane) for plane in held]
 
     def _picture(self, picture: I420) -> LentBuffer:
-        """Return the buffer of a picture of the CPU's, uploaded unless it is here."""
+        """Return the buffer of a CPU picture, and upload it if necessary."""
         for each, lent in self._pictures:
             if each() is picture:
                 return lent
@@ -278,7 +277,7 @@ class DeviceRasterizer:
         return self._keep_picture(picture)
 
     def _keep_picture(self, picture: I420) -> LentBuffer:
-        """Keep the buffer ``picture``, which holds one of the CPU's, as long as that lives."""
+        """Keep the buffer ``picture``, the copy of a CPU picture, as long as that one lives."""
         lent = self._memory.lend("picture", _size_bytes(picture))
         alive = [(each, kept) for each, kept in self._pictures if each() is not None]
         self._pictures = [*alive[-(MOST_PICTURES - 1) :], (ref(picture), lent)]

@@ -1,8 +1,8 @@
-"""What a device must show before its pictures are believed.
+"""Tests an OpenCL device before it is used.
 
-What a driver says of itself is no gate: one that reports neither fused multiply-add nor correct
-rounding may be exact, and another that reports both may contract. So its arithmetic is compared on
-bit patterns and whole pictures with the digests of the native kernels, which reach every path:
+A driver's own claims do not help: one that reports neither fused multiply-add nor correct rounding
+may be exact, and another that reports both may contract. So the device's arithmetic is compared on
+bit patterns, and whole pictures with the digests of the native kernels, which reach every path:
 all SH degrees, both modes, splats of all sizes, ties, several batches a tile, opaque pixels. Its
 codec pictures, warps and corrections are compared with those of the CPU: odd sizes, holes, steps of
 depth, depths of any size, poses that leave the earlier picture.
@@ -53,7 +53,7 @@ _lock = Lock()
 
 
 def open_device(wanted: str = "") -> Device:
-    """Return the device of a name (``find_device``), opened and checked once in a process.
+    """Return the device called so (``find_device``), opened and tested once in a process.
 
     The builds are tried in their order. Raises ``BackendUnavailable`` with what was wrong with
     each when none is exact.
@@ -97,13 +97,13 @@ TINY = np.finfo(np.float32).tiny
 
 
 class Chance:
-    """Numbers of a counter mixed by integer arithmetic: the same bits whatever numpy is used."""
+    """Pseudo-random numbers by integer arithmetic: the same bits with every version of numpy."""
 
     def __init__(self) -> None:
         self._drawn = 0
 
     def bits(self, *shape: int) -> NDArray[np.uint32]:
-        """Return 32 bits each (the finalizer of MurmurHash3)."""
+        """Return 32 random bits each (the finalizer of MurmurHash3)."""
         count = int(np.prod(shape))
         x = np.arange(self._drawn, self._drawn + count, dtype=np.uint32)
         self._drawn += count
@@ -119,7 +119,7 @@ class Chance:
 
 
 def arithmetic_operands() -> tuple[F32, F32, F32]:
-    """Return x, y and z [PATTERNS]: any bits, numbers near 1, small ones, whole ones, specials.
+    """Return x, y and z [PATTERNS]: random bits, numbers near 1, small, integer and special ones.
 
     Subnormals are zero: some devices flush them, and no byte of a picture depends on one.
     """
@@ -149,13 +149,13 @@ def digest(*arrays: NDArray[np.float32]) -> str:
 
 
 def bytes_of(view: FieldView) -> bytes:
-    """Return all that a codec's end holds of a picture, which is drawn with its opacity."""
+    """Return depth, opacity and codec picture of one drawing."""
     arrays = (*view.render.planes, view.depth, view.kept_opacity)
     return b"".join(array.tobytes() for array in arrays)
 
 
 def arithmetic_on(device: Device) -> F32:
-    """Return what the device makes of the operands [6, PATTERNS], canonical."""
+    """Return the device's canonical results [6, PATTERNS] for the operands."""
     queue, flags = cl.CommandQueue(device.context), cl.mem_flags
     operands = [
         cl.Buffer(device.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=operand)
@@ -170,14 +170,14 @@ def arithmetic_on(device: Device) -> F32:
 
 
 class Check:
-    """One picture of a self-check: how it is drawn, and the digest that the native kernels give."""
+    """One picture of a self-check: its settings, and the digest that the native kernels give."""
 
     def __init__(self, size_px: tuple[int, int], degree: int, antialiased: bool, want: str) -> None:
         self.camera, self.degree, self.antialiased = _camera(*size_px), degree, antialiased
         self.want = want
 
     def on(self, device: Device, gaussians: Gaussians) -> tuple[View, FieldView]:
-        """Return the picture that the device draws, and the codec's that it makes of it."""
+        """Return the device's picture, and the codec picture that it makes of it."""
         k = self.camera.intrinsics
         shape = (k.height_px, k.width_px)
         view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
@@ -340,7 +340,7 @@ def _check_carried(device: DeviceRasterizer, case: WarpCase) -> None:
 def carried_on(
     device: DeviceRasterizer, previous: I420, minus: I420 | None, before: FieldView, now: FieldView
 ) -> I420:
-    """Return the warp or, with ``minus``, the correction that a device makes of the CPU's views."""
+    """Return a device's warp or, with ``minus``, its correction, of views of the CPU."""
     earlier, depth = (device.hold(view.depth).lent for view in (before, now))
     assert earlier is not None
     assert depth is not None
