@@ -138,7 +138,8 @@ class Side(asyncio.BufferedProtocol):
     def _deliver_end(self) -> None:
         transport = self.peer.transport if self.peer is not None else None
         if transport is not None and transport.can_write_eof() and not transport.is_closing():
-            transport.write_eof()
+            with suppress(OSError):  # the other end is gone, and the event loop did not hear of it
+                transport.write_eof()
 
     def _close_peer(self) -> None:
         if self.peer is not None and self.peer.transport is not None:

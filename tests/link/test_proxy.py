@@ -1,6 +1,7 @@
 """The proxy on real sockets: what goes in comes out, on time, both ways."""
 
 import asyncio
+import errno
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
@@ -10,7 +11,9 @@ from typing import Any
 import pytest
 
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.link.proxy import LinkProxy, ProxySettings
+from rfcore.link import DirectionPlan, LinkProfile
+from rfedge.link.direction import Direction
+from rfedge.link.proxy import LinkProxy, ProxySettings, Side
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 FAST: dict[str, float] = {"uplink_bps": 1e9, "downlink_bps": 1e9, "delay_ms": 0.0}
@@ -114,6 +117,28 @@ async def test_a_server_that_closes_closes_the_vehicle_s_end_behind_its_last_byt
         reader, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
         assert await reader.read(-1) == b"goodbye" * 1000
         writer.close()
+
+
+async def test_an_end_that_vanished_unheard_leaves_the_link_to_the_others() -> None:
+    class Vanished(asyncio.Transport):
+        def can_write_eof(self) -> bool:
+            return True
+
+        def is_closing(self) -> bool:
+            return False
+
+        def write_eof(self) -> None:
+            raise OSError(errno.ENOTCONN, "Transport endpoint is not connected")
+
+    direction = Direction(DirectionPlan(LinkProfile(1e9)))
+    here, gone = (Side(direction, lambda: None) for _ in range(2))
+    here.peer, gone.transport = gone, Vanished()
+    pump = asyncio.create_task(direction.pump())
+    here.eof_received()
+    arrived = asyncio.Event()
+    direction.push(arrived.set, 1)
+    await asyncio.wait_for(arrived.wait(), 10)
+    pump.cancel()
 
 
 async def test_a_taken_port_is_one_clear_error() -> None:
