@@ -201,7 +201,7 @@ results results-full: build-full  ## record anew what takes two hours, or everyt
 results-%: build-full  ## record `rfedge eval NAME` in lab/results/NAME.json; options in ARGS (docs/explanation/evaluation.md)
 	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json
 
-figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md
+figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.md
 	$(BIN)/python -m lab.pages.results lab/results docs README.md
 	$(BIN)/python -m rfedge.evaluate.ladder.page lab/results docs
 	$(BIN)/python -m lab.pages.faults lab/results/faults.json > docs/reliability.md.part
@@ -211,12 +211,10 @@ figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.
 		mv docs/attacks.md.part docs/attacks.md; fi
 	$(BIN)/python -m lab.pages.sizing > docs/sizing.md.part
 	mv docs/sizing.md.part docs/sizing.md
-	$(BIN)/python -m lab.pages.metrics > docs/metrics.md.part
-	mv docs/metrics.md.part docs/metrics.md
 
 docs: build-full  ## build the documentation site in build/site; a dead link is an error
 	$(BIN)/python -m pip install -q --no-deps --require-hashes -r requirements/docs.txt
-	NO_COLOR=1 $(BIN)/python docs/build_site.py
+	$(BIN)/python docs/build_site.py
 
 nightly:  ## what .ci/run leaves out: faults, wheels of every Python, half an hour of load, containers
 	.ci/run nightly

@@ -7,6 +7,7 @@ make ``build/site`` of them. A dead link is an error. ``--pages`` stops before z
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import io
 import os
@@ -20,19 +21,15 @@ from pathlib import Path
 from unittest import mock
 
 import tyro
-from prometheus_client import CollectorRegistry
 
 import lab.cli
 import rfedge.cli
 import streetgen.cli
 from cav_agent.config import AgentConfig
-from cav_agent.metrics import AgentMetrics
+from lab.pages.metrics import families
 from mec_server.config import ServerConfig
-from mec_server.metrics import ServerMetrics
-from mec_server.twin.metrics import TwinMetrics
 from rfcore.wire.instruments import Family
 from rfcore.wire.settings import OPTIONS
-from rfedge.link.metrics import LinkMetrics
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs"
@@ -65,7 +62,7 @@ API: Mapping[str, Sequence[str]] = {
         "rfcore.codec.decoder.DeltaDecoder",
     ),
     "A server and an agent": ("mec_server.server.EdgeServer", "cav_agent.vehicle.Vehicle"),
-    "Reading a twin": ("rfcore.wire.twin_render.render_view",),
+    "Reading a twin": ("rfcore.wire.twin_client.TwinClient",),
     "A codec of one's own": ("rfedge.evaluate.clips.ClipCoder",),
     "Sizes of uplinks": ("rfedge.sizing.estimate",),
     "Errors": ("rfcore.errors",),
@@ -85,7 +82,7 @@ FORMATS: Mapping[str, str] = {
 FILES: Mapping[str, str] = {
     "Recordings: `camera.toml`": "rfcore.dataset.recording",
     "Rigs of cameras: `rig.toml`": "rfcore.dataset.rig",
-    "Links: `rfedge link --profile`": "rfcore.link.profile_file",
+    "Links: `rfedge link --profile`": "rfcore.link.plan",
     "Access to a server: `mec-server --access`": "mec_server.access",
     "Streets: `streetgen build`": "streetgen.scene_file",
 }
@@ -147,11 +144,13 @@ def _items(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
         yield term, " ".join(words).strip()
 
 
-def command_pages() -> Iterator[tuple[str, str]]:
-    """Yield a page for each program: every verb and option, as the parser has them."""
-    for name, parse in PROGRAMS.items():
-        sections = "\n".join(_sections(name, parse, ()))
-        yield f"commands/{name}.md", f"{GENERATED}# {name}\n\n{sections}"
+@functools.cache
+def command_pages() -> Mapping[str, str]:
+    """Return a page for each program: every verb and option, as the parser has them."""
+    return {
+        f"commands/{name}.md": f"{GENERATED}# {name}\n\n" + "\n".join(_sections(name, parse, ()))
+        for name, parse in PROGRAMS.items()
+    }
 
 
 def _sections(name: str, parse: Parse, words: Sequence[str]) -> Iterator[str]:
@@ -188,19 +187,6 @@ def table(heads: Sequence[str], rows: Iterator[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [heads, ["---"] * len(heads), *rows]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
-
-
-def families() -> Mapping[str, Sequence[Family]]:
-    """Return the metrics that each program declares, with those that a flag can add."""
-    agent = AgentMetrics(CollectorRegistry())
-    agent.identify("cav-1", "front")
-    server = ServerMetrics(CollectorRegistry(), per_vehicle=True)
-    TwinMetrics(server.instruments, dict, int, per_vehicle=True)
-    return {
-        "mec-server": server.instruments.families,
-        "cav-agent": agent.instruments.families,
-        "rfedge link": LinkMetrics(CollectorRegistry()).instruments.families,
-    }
 
 
 def metrics_page() -> str:
@@ -271,10 +257,22 @@ def configuration_page() -> str:
     return docstrings_page("Configuration", introduction, FILES)
 
 
+def option_names(program: str) -> set[str]:
+    """Return every option of a program and its verbs, as ``--name``."""
+    page = command_pages()[f"commands/{program}.md"]
+    return {"--help", *re.findall(r"--[a-z][a-z0-9-]*", page)}
+
+
+def reference_names() -> list[str]:
+    """Return the names of the generated pages under ``reference``."""
+    programs = [f"commands/{name}.md" for name in PROGRAMS]
+    return [*programs, "configuration.md", "protocol.md", "files.md", "metrics.md", "python.md"]
+
+
 def reference() -> dict[str, str]:
     """Return the generated pages by their names under ``reference``."""
     return {
-        **dict(command_pages()),
+        **command_pages(),
         "configuration.md": configuration_page(),
         "protocol.md": protocol_page(),
         "files.md": docstrings_page("File formats", "Files that rfedge writes.", FORMATS),
@@ -302,7 +300,8 @@ def collect(folder: Path = BUILD) -> None:
 
 def on_site(text: str) -> str:
     """Return a page whose links to recorded results lead to where the site has them."""
-    return re.sub(r"\]\((\.\./)+lab/results/", "](../results/", text)
+    text = re.sub(r"\]\((\.\./)+lab/results/", "](../results/", text)
+    return text.replace("<details>", '<details markdown="1">')
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -311,7 +310,10 @@ def main(arguments: Sequence[str]) -> int:
     if "--pages" in arguments:
         return 0
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
-    return subprocess.run(command, cwd=ROOT, check=False).returncode
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    said = re.sub(r"\x1b\[[0-9;]*m", "", built.stdout + built.stderr)
+    print(said.partition("Traceback (most recent")[0].strip())
+    return built.returncode
 
 
 if __name__ == "__main__":

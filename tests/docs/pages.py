@@ -1,17 +1,33 @@
-"""The fenced blocks of a documentation page, and the commands in them."""
+"""The pages of the documentation, their fenced blocks, and the commands in them."""
 
+import importlib.util
 import re
 import shlex
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PROGRAMS = ("rfedge", "cav-agent", "mec-server", "streetgen", "rfedge-lab")
+
+
+def load_build_site() -> Any:
+    """Load ``docs/build_site.py``, which is in no package."""
+    spec = importlib.util.spec_from_file_location("build_site", DOCS / "build_site.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 @dataclass(frozen=True)
 class Page:
-    """A page of docs, by its file's name."""
+    """A Markdown file, by its path in ``docs``."""
 
     name: str
 
@@ -24,9 +40,17 @@ class Page:
         """Return the blocks that are marked with a language, without the fences."""
         return re.findall(rf"^```{language}\n(.*?)^```", self.text, re.MULTILINE | re.DOTALL)
 
-    def commands(self, language: str) -> Iterator[list[str]]:
-        """Return the arguments of each line of ``rfedge`` in those blocks."""
-        for block in self.blocks(language):
-            for line in block.splitlines():
-                if line.startswith("rfedge "):
-                    yield shlex.split(line, comments=True)[1:]
+    def commands(self, *languages: str) -> Iterator[list[str]]:
+        """Return the words of each line of those blocks that runs one of our programs."""
+        for language in languages:
+            for block in self.blocks(language):
+                yield from commands(block)
+
+
+def commands(block: str) -> Iterator[list[str]]:
+    """Return the words of each line that runs one of our programs; ``\\`` joins lines."""
+    for line in block.replace("\\\n", " ").splitlines():
+        for part in re.split(r" [&|]+ |; | &$", line.removeprefix("$ ")):
+            if part.split(" ")[0] in PROGRAMS:
+                words = shlex.split(part.partition(" > ")[0], comments=True)
+                yield [word for word in words if word != "&"]

@@ -131,13 +131,6 @@ async def stack() -> AsyncIterator[AsyncExitStack]:
         yield opened
 
 
-@pytest.mark.parametrize(
-    "command", [*PAGE.commands("sh"), *PAGE.commands("text")], ids=" ".join
-)  # fmt: skip
-def test_every_command_of_the_page_is_one(command: list[str]) -> None:
-    assert parse(command) is not None
-
-
 def every_result(vehicle: Any) -> set[str]:
     return {line["result"] for line in vehicle.lines()}
 

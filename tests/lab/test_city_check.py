@@ -14,7 +14,6 @@ from lab.city.flow import Costs, costs_of
 from lab.city.plan import MinuteRow, plan_city
 from lab.city.sessions import SampledServer, SessionFigures, run_sessions
 from lab.city.traffic import stated_traffic
-from lab.pages.sizing import CITY_MARK, city_table
 from rfcore.errors import InvalidInput
 from rfedge.cli import parse
 from rfedge.samples import sample_path
@@ -182,11 +181,3 @@ def test_what_cannot_be_planned_is_said(tmp_path: Path, arguments: list[str], sa
     given = [city if argument == "CITY" else argument for argument in arguments]
     with pytest.raises(InvalidInput, match=said):
         parse(["size", *given, "--out", str(tmp_path)]).run()
-
-
-def test_the_page_has_the_table_that_the_model_makes() -> None:
-    page = (DOCS / "how-to" / "servers.md").read_text()
-    before, mark, after = page.partition(CITY_MARK)
-    assert mark
-    assert before
-    assert after.strip().startswith(city_table().strip()), "python -m lab.pages.sizing city"

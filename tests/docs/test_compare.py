@@ -1,4 +1,4 @@
-"""The example of a user's codec that ``docs/explanation/evaluation.md`` names is one."""
+"""The example of a user's codec that ``docs/how-to/compare.md`` names is one."""
 
 import runpy
 from pathlib import Path
@@ -15,7 +15,7 @@ EXAMPLE = "examples/own_codec.py"
 @pytest.mark.parametrize("size_px", [(64, 48), (63, 47)])
 def test_the_example_codec_codes_a_clip_better_where_it_says_so(size_px):
     width_px, height_px = size_px
-    assert EXAMPLE in (ROOT / "docs" / "explanation" / "evaluation.md").read_text(encoding="utf-8")
+    assert EXAMPLE in (ROOT / "docs" / "how-to" / "compare.md").read_text(encoding="utf-8")
     coder = runpy.run_path(str(ROOT / EXAMPLE))["MotionJpeg"]()
     rng = np.random.default_rng(1)
     chroma = np.full((24, 32), 128, np.uint8)

@@ -1,0 +1,27 @@
+"""The program of docs/how-to/python.md runs as it stands there."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from docs.pages import ROOT, Page
+from rfedge.cli import parse
+
+SAMPLE = ROOT / "samples" / "street" / "transforms_drive_empty.json"
+
+
+@pytest.mark.sample
+def test_the_program_renders_encodes_and_decodes(tmp_path: Path) -> None:
+    few = ["--size", "160x90", "--every", "8"]
+    parse(["dataset", "convert", str(SAMPLE), "--out", str(tmp_path / "drive"), *few]).run()
+    (tmp_path / "street.rff").symlink_to(ROOT / "samples" / "fields" / "street.rff")
+    program = "\n".join(Page("how-to/python.md").blocks("python"))
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    first, *sizes = done.stdout.splitlines()
+    assert first == "(90, 160, 3) (90, 160) (90, 160)"
+    assert [line.split()[0] for line in sizes] == ["0", "1", "2"]
