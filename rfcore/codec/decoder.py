@@ -51,7 +51,9 @@ class Decoded:
 
 
 class DeltaDecoder:
-    """Decodes packets one by one. Raises ``InvalidInput`` for a header our encoder would not make.
+    """Decodes packets one by one; ``DeltaEncoder`` has an example.
+
+    Raises ``InvalidInput`` for a header that our encoder would not make.
 
     With ``exact=False`` the sender's renderer may differ by rounding: a render of another digest
     but of the same block means, up to rounding, is accepted, and its reconstruction cannot be

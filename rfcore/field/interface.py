@@ -181,6 +181,15 @@ def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FUL
     """Render what ``camera`` sees, in the form that both ends of the codec use.
 
     A sender passes the camera that it sends: ``Camera.rounded``.
+
+    >>> from pathlib import Path
+    >>> from rfcore.camera import Intrinsics, Pose
+    >>> from rfcore.field import load_field
+    >>> field = load_field(Path("samples/fields/street.rff"), threads=2)
+    >>> camera = Camera(Intrinsics(64, 36, 50.0, 50.0, 32.0, 18.0), Pose.identity())
+    >>> view = render_field_view(field, camera.rounded(), Quality(detail=0.25))
+    >>> view.render.size_px
+    (64, 36)
     """
     if isinstance(renderer, CodecPictureRenderer):
         return renderer.field_view(camera, quality)

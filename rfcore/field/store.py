@@ -205,7 +205,17 @@ def decode_beginning(
 def load_field(
     path: Path, *, threads: int = 1, isa: str | None = None, max_bytes: int = DECODED_BYTES
 ) -> RadianceField:
-    """Read a field archive; raise ``FieldFormatError`` naming the file and what is wrong."""
+    """Read a field archive; raise ``FieldFormatError`` naming the file and what is wrong.
+
+    >>> from rfcore.camera import Camera, Intrinsics, Pose
+    >>> field = load_field(Path("samples/fields/street.rff"), threads=2)
+    >>> field.primitives
+    280000
+    >>> camera = Camera(Intrinsics(64, 36, 50.0, 50.0, 32.0, 18.0), Pose.identity())
+    >>> view = field.render(camera)
+    >>> view.colour.shape, view.depth.shape
+    ((36, 64, 3), (36, 64))
+    """
     data = read_file(path, max_bytes)
 
     def beside(field_id: str) -> RadianceField:
@@ -236,6 +246,18 @@ def save_field(field: RadianceField, path: Path) -> str:
     """Write a field's archive, whole or not at all, and return the field's id.
 
     A field that was loaded is written as it was; ``SplatField.compressed`` makes the small form.
+
+    >>> import numpy as np
+    >>> from tempfile import TemporaryDirectory
+    >>> from rfcore.raster.gaussians import Gaussians, gaussian_shapes
+    >>> shapes = gaussian_shapes(count=100, sh_degree=1)
+    >>> splats = Gaussians(**{name: np.ones(shape, np.float32) for name, shape in shapes.items()})
+    >>> field = SplatField(splats, FieldMetadata("wall")).compressed()
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "wall.rff"
+    ...     field_id = save_field(field, path)
+    ...     load_field(path).field_id == field_id == field.field_id
+    True
     """
     data = encode_field(field)
     write_whole(path, data)

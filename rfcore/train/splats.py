@@ -96,6 +96,17 @@ class SplatTrainer(FieldTrainer):
     ``start`` is the points to start from, or Gaussians to go on with. Every picture is read into
     memory at once. Raises ``InvalidInput`` on settings, too few points or no pictures, and
     ``DatasetError`` on pictures that cannot be read.
+
+    >>> from rfcore.camera import Intrinsics, Pose
+    >>> camera = Camera(Intrinsics(32, 24, 30.0, 30.0, 16.0, 12.0), Pose.identity())
+    >>> picture = PosedPicture("a.png", camera, lambda: np.full((24, 32, 3), 200, np.uint8))
+    >>> xyz_m = np.random.default_rng(0).uniform(-1, 1, (50, 3)).astype(np.float32)
+    >>> points = PointCloud(xyz_m + np.float32([0, 0, 4]), np.full((50, 3), 200, np.uint8))
+    >>> trainer = SplatTrainer([picture], points, SplatTrainingConfig(iterations=3))
+    >>> [progress.iteration for progress in trainer.steps()]
+    [1, 2, 3]
+    >>> trainer.field("wall").primitives
+    50
     """
 
     kind = SPLATS

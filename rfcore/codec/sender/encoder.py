@@ -162,6 +162,20 @@ class DeltaEncoder:
     number; x264's slices may differ by a few bytes between one thread and more. ``check_decode``:
     decode the slices of our coder, too, and raise ``CodecError`` unless the picture is the promised
     one; x264's slices are always decoded.
+
+    >>> import numpy as np
+    >>> from rfcore.camera import Camera, Intrinsics, Pose
+    >>> from rfcore.codec.decoder import DeltaDecoder
+    >>> camera = Camera(Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0), Pose.identity())
+    >>> render = I420.filled((64, 48), 100)  # normally of a field, by ``render_field_view``
+    >>> view = FieldView(camera, render, np.ones((48, 64), np.float32))
+    >>> frame = I420.filled((64, 48), 110)
+    >>> encoder = DeltaEncoder(CodecConfig(64, 48, crf=23.0))
+    >>> encoded = encoder.encode(encoder.start(epoch=1), frame, view)
+    >>> decoder = DeltaDecoder(encoder.header)
+    >>> decoded = decoder.decode(decoder.start(), encoded.packet, view)
+    >>> decoded.frame.digest() == encoded.reconstruction.digest()
+    True
     """
 
     def __init__(
