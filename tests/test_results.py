@@ -1,7 +1,6 @@
 """A result says how it was made, and comes back from its file as it was."""
 
 import hashlib
-import itertools
 import json
 import math
 import re
@@ -318,18 +317,3 @@ def test_several_servers_show_what_they_must_and_whether_it_held() -> None:
     } == set()
     told = [case for run in result["runs"] for case in run["cases"]]
     assert sorted(told) == sorted(rows), "each row is of one run"
-
-
-def test_a_make_target_that_writes_results_says_so_in_its_help() -> None:
-    """A target's recipe names the file after an option that writes, as --out or --record."""
-    lines = (ROOT / "Makefile").read_text().splitlines()
-    variables = dict(re.findall(r"^(\w+) *[:?]?= *(.*)$", "\n".join(lines), flags=re.MULTILINE))
-    writers = []
-    for number, line in enumerate(lines):
-        target = re.match(r"([a-z%-]+):(?!=).*", line)
-        recipe = itertools.takewhile(lambda text: text.startswith("\t"), lines[number + 1 :])
-        text = re.sub(r"\$\((\w+)\)", lambda name: variables.get(name[1], ""), "\n".join(recipe))
-        if target and re.search(r"--(out|record|[a-z]+-json) results/", text):
-            writers.append(target[1])
-            assert "results/" in line.partition("## ")[2], f"{target[1]} does not say so"
-    assert {"test-fault", "load-full", "results-%"} <= set(writers)
