@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import re
+import signal
 import socket
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -63,12 +65,12 @@ from rfcore.files import write_whole
 from rfcore.wire.address import Address
 from rfcore.wire.checks import MAX_FIELDS
 from rfcore.wire.conventions import SERVER_OPTIONS
-from rfcore.wire.instruments import MetricsEndpoint
+from rfcore.wire.instruments import Family, MetricsEndpoint
 
 if TYPE_CHECKING:
     from mec_server.twin.nats import NatsServices
 
-__all__ = ["EdgeServer"]
+__all__ = ["EdgeServer", "metric_families", "serve"]
 
 log = structlog.get_logger()
 
@@ -110,6 +112,20 @@ SERVICES = ("", *(f"rfcore.wire.v1.{name}Service" for name in ("Edge", "Field", 
 
 class EdgeServer:
     """Serves the fields of ``config.fields``; ``start``, then ``stop``.
+
+    >>> import asyncio, sys
+    >>> from pathlib import Path
+    >>> from mec_server.config import ServerConfig
+    >>> from mec_server.server import EdgeServer
+    >>> from rfcore.wire.settings import configure_logs
+    >>> async def serve_for_a_moment() -> str:
+    ...     server = EdgeServer(ServerConfig(Path("samples/fields"), listen="127.0.0.1:0"))
+    ...     address = await server.start()  # vehicles and consumers may connect now
+    ...     await server.stop()
+    ...     return address.host
+    >>> configure_logs(sys.stderr)
+    >>> asyncio.run(serve_for_a_moment())
+    '127.0.0.1'
 
     ``open_decoders`` opens the decoders for a Hello; a load test replaces it. ``classify`` names
     objects that cameras see and the field lacks (``StreetObject.label``), for programs that embed
@@ -495,6 +511,27 @@ class EdgeServer:
     async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
         for service in SERVICES:
             await self._health.set(service, status)
+
+
+async def serve(config: ServerConfig, opened: OpenCameras = open_cameras) -> None:
+    """Serve until SIGTERM or SIGINT, then drain."""
+    server = EdgeServer(config, opened)
+    stopped = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    await server.start()
+    gc.collect()
+    gc.freeze()  # a search of all objects for cycles stops every thread for 50 ms
+    await stopped.wait()
+    gc.unfreeze()  # so that objects of the native library are collected at the end
+    await server.stop()
+
+
+def metric_families() -> Sequence[Family]:
+    """Return the metrics that a server exports, with everything that an option can add."""
+    metrics = ServerMetrics(CollectorRegistry(), per_vehicle=True)
+    TwinMetrics(metrics.instruments, Twin(), per_vehicle=True)
+    return metrics.instruments.families
 
 
 def _give_way() -> None:

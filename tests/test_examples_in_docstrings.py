@@ -9,9 +9,16 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import structlog
 
 ROOT = Path(__file__).parents[1]
 ENTRY_POINTS = [
+    "mec_server.server.EdgeServer",
+    "rfcore.dataset.read.read_dataset",
+    "rfcore.link.plan.read_link",
+    "rfcore.link.shaper.Link",
+    "rfcore.localise.localiser.Localiser",
+    "rfcore.wire.drive_file.read_drive",
     "rfcore.codec.sender.encoder.DeltaEncoder",
     "rfcore.field.interface.render_field_view",
     "rfcore.field.store.load_field",
@@ -34,4 +41,5 @@ def test_the_example_of_an_entry_point_runs(name: str, monkeypatch: pytest.Monke
     outcome = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(
         example, out=report.append
     )
+    structlog.reset_defaults()
     assert outcome.failed == 0, "".join(report)

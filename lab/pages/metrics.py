@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from prometheus_client import CollectorRegistry
 
 from cav_agent.metrics import AgentMetrics
-from mec_server.metrics import ServerMetrics
-from mec_server.twin.metrics import TwinMetrics
-from mec_server.twin.state import Twin
+from mec_server.server import metric_families
 from rfcore.wire.instruments import Family
 from rfedge.link.metrics import LinkMetrics
 
@@ -20,10 +18,8 @@ def families() -> Mapping[str, Sequence[Family]]:
     """Return what each command declares, with everything that a flag can add."""
     agent = AgentMetrics(CollectorRegistry())
     agent.identify("cav-1", "front")
-    server = ServerMetrics(CollectorRegistry(), per_vehicle=True)
-    TwinMetrics(server.instruments, Twin(), per_vehicle=True)
     return {
-        "mec-server": server.instruments.families,
+        "mec-server": metric_families(),
         "cav-agent": agent.instruments.families,
         "rfedge link": LinkMetrics(CollectorRegistry()).instruments.families,
     }

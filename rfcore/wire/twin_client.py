@@ -59,10 +59,13 @@ def twin_error(error: grpc.RpcError) -> RfedgeError:
 class TwinClient:
     """Watches one server's twin and asks it for views; for threads.
 
-    >>> with TwinClient("127.0.0.1:50051") as twin:  # doctest: +SKIP
-    ...     for message in twin.watch(Subscription(encoding=PictureEncoding.I420)):
+    >>> from rfcore.wire.twin import TwinPicture
+    >>> from rfcore.wire.twin_client import TwinClient
+    >>> with TwinClient("127.0.0.1:50051") as twin:
+    ...     for message in twin.watch():
     ...         if isinstance(message, TwinPicture):
-    ...             print(message.vehicle_id, message.sequence, message.rgb.shape)
+    ...             print(message.vehicle_id, message.camera_id, message.rgb.shape)
+    cav-1 front (360, 640, 3)
 
     Raises ``InvalidInput`` for an address that is none, and for plaintext to another machine unless
     ``allow_insecure``.

@@ -14,7 +14,6 @@ import sys
 from collections import OrderedDict
 from pathlib import Path
 
-from mec_server.__main__ import serve
 from mec_server.config import AdmissionLimits, ServerBudget, ServerConfig
 from mec_server.reconstruction import (
     Decoder,
@@ -24,6 +23,7 @@ from mec_server.reconstruction import (
     Tools,
     open_cameras,
 )
+from mec_server.server import serve
 from mec_server.session import DecodeJob, OpenJob
 from rfcore.camera import Camera
 from rfcore.field import Quality, Renderer

@@ -1,6 +1,7 @@
 """Consumers of the twin beside real vehicles: exact, limited, and never in the way."""
 
 import asyncio
+import doctest
 import json
 import signal
 import subprocess
@@ -70,6 +71,22 @@ async def test_a_consumer_sees_to_the_bit_what_the_vehicle_holds(serve: Any, tra
         assert picture.reconstruction_digest.hex() == held[picture.sequence]
         assert (picture.vehicle_id, picture.camera_id) == ("cav-1", "front")
         assert picture.age_ns > 0
+
+
+async def test_the_example_of_the_client_runs(serve: Any, travel: Any, capsys: Any) -> None:
+    assert TwinClient.__doc__ is not None
+    examples = doctest.DocTestParser().get_examples(TwinClient.__doc__)
+    source = "".join(example.source for example in examples)
+    async with serve() as server:
+        watching = asyncio.create_task(
+            asyncio.to_thread(exec, source.replace("127.0.0.1:50051", str(server.address)), {})
+        )
+        while not server.registry.get_sample_value("rfedge_twin_consumers"):
+            await asyncio.sleep(0.01)
+        await travel(server.address)
+        await server.stop()
+        await watching
+    assert "cav-1 front (52, 76, 3)" in capsys.readouterr().out.splitlines()
 
 
 @pytest.mark.parametrize(("encoding", "worst"), [("png", 0), ("jpeg", 12), ("none", None)])
