@@ -19,15 +19,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("rfcore", "cav_agent", "mec_server", "rfedge")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-OWNERS_SEVEN = {
-    "grpcio",
-    "protobuf",
-    "torch",
-    "av",
-    "numpy",
-    "opencv-contrib-python-headless",
-    "prometheus-client",
-}
 
 
 def name_of(requirement: str) -> str:
@@ -170,16 +161,6 @@ def test_the_search_sees_an_import_that_is_wrong(source: str, wrong: list[str]) 
     assert found == wrong
 
 
-def test_the_owners_packages_are_all_dependencies_or_extras() -> None:
-    everything = BASE | {name_of(line) for lines in EXTRAS.values() for line in lines}
-    assert everything >= OWNERS_SEVEN
-
-
-def test_torch_is_pinned_wherever_it_is_named() -> None:
-    lines = [line for lines in EXTRAS.values() for line in lines if name_of(line) == "torch"]
-    assert set(lines) == {"torch==2.13.0"}
-
-
 def test_a_package_that_is_missing_or_broken_is_named_with_its_extra(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -240,10 +221,7 @@ DRIVE = f"empty@10={ROOT / 'samples/street/transforms_drive_empty.json'}"
 @pytest.mark.parametrize(
     ("package", "extra", "command"),
     [
-        ("torch", "reference", "bench raster"),
-        ("torch", "reference", "bench train"),
-        ("torch", "reference", "bench ngp"),
-        ("pyopencl", "opencl", "bench raster --isa opencl"),
+        ("pyopencl", "opencl", f"render {FIELD} --out made --renderer opencl"),
         ("scipy", "eval", f"eval compare {FIELD} {DRIVE}"),
         ("scipy", "eval", f"eval never-worse {FIELD} {DRIVE}"),
         ("cv2", "localise", f"localise {DRIVE.partition('=')[2]} --field {FIELD}"),
