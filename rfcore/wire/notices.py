@@ -12,6 +12,7 @@ from enum import StrEnum
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.wire.checks import check_field_id, check_label, check_name, check_range
 from rfcore.wire.v1 import edge_pb2 as pb
+from rfcore.wire.values import same_named
 
 __all__ = [
     "NOTICE_KINDS",
@@ -176,18 +177,16 @@ def _object_from_wire(message: pb.ObjectAhead) -> ObjectAhead:
         check_range("object", value, -1e9, 1e9)
     for size_m in (message.width_m, message.height_m, message.distance_m):
         check_range("object", size_m, 0.0, 1e9)
-    return ObjectAhead(
-        check_field_id("field_id", message.field_id),
-        at_m,
-        velocity_mps,
-        message.width_m,
-        message.height_m,
-        message.distance_m,
-        check_range("confidence", message.confidence, 0.0, 1.0),
-        message.age_ms / 1e3,
-        message.unseen_ms / 1e3,
-        message.vehicles,
-        check_label("label", message.label),
+    return same_named(
+        ObjectAhead,
+        message,
+        field_id=check_field_id("field_id", message.field_id),
+        at_m=at_m,
+        velocity_mps=velocity_mps,
+        confidence=check_range("confidence", message.confidence, 0.0, 1.0),
+        age_s=message.age_ms / 1e3,
+        unseen_s=message.unseen_ms / 1e3,
+        label=check_label("label", message.label),
     )
 
 

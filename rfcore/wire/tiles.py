@@ -8,11 +8,12 @@ server that publishes no tiles serves its fields everywhere.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_label, check_name, check_range
 from rfcore.wire.v1 import field_pb2 as pb
+from rfcore.wire.values import same_named
 
 __all__ = [
     "MAX_LIGHTS",
@@ -176,7 +177,7 @@ def learnt_message(learnt: LearntLight) -> pb.LearntLight:
 
 def learnt_of(message: pb.LearntLight) -> LearntLight:
     """Return what a server says it learnt; raise ``InvalidInput`` naming what is wrong with it."""
-    return LearntLight(**{each.name: getattr(message, each.name) for each in fields(LearntLight)})
+    return same_named(LearntLight, message)
 
 
 def tile_message(tile: Tile) -> pb.Tile:
@@ -213,11 +214,5 @@ def tile_of(message: pb.Tile) -> Tile:
 
 
 def _light_of(message: pb.TileLight) -> TileLight:
-    return TileLight(
-        name=message.name,
-        field_id=message.field_id,
-        version=message.version,
-        base_field_id=message.base_field_id,
-        passes=message.passes,
-        time_of_day_h=message.time_of_day_h if message.HasField("time_of_day_h") else None,
-    )
+    hour = message.time_of_day_h if message.HasField("time_of_day_h") else None
+    return same_named(TileLight, message, time_of_day_h=hour)

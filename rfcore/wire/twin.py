@@ -31,6 +31,7 @@ from rfcore.wire.values import (
     pose_to_wire,
     references_from_wire,
     references_to_wire,
+    same_named,
 )
 
 __all__ = [
@@ -200,50 +201,31 @@ def twin_message_from_wire(response: twin_pb2.WatchResponse) -> TwinPicture | De
 
 
 def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
-    return twin_pb2.TwinPicture(
-        vehicle_id=message.vehicle_id,
-        camera_id=message.camera_id,
-        session_id=message.session_id,
-        epoch=message.epoch,
-        sequence=message.sequence,
-        capture_time_ns=message.capture_time_ns,
-        age_ns=message.age_ns,
-        pose=None if message.pose is None else pose_to_wire(message.pose),
-        intrinsics=intrinsics_to_wire(message.intrinsics),
-        field_id=message.field_id,
-        reconstruction_digest=message.reconstruction_digest,
-        encoding=encoding_to_wire(message.encoding),
-        picture=message.picture,
-        skipped=message.skipped,
-        payload_bytes=message.payload_bytes,
-        references=references_to_wire(message.references),
-        capture_clock=clock_to_wire(message.clock),
-        localisation=localisation_to_wire(message.localisation),
-        instant=message.instant,
-    )
+    values = {
+        **vars(message),
+        "pose": None if message.pose is None else pose_to_wire(message.pose),
+        "intrinsics": intrinsics_to_wire(message.intrinsics),
+        "encoding": encoding_to_wire(message.encoding),
+        "references": references_to_wire(message.references),
+        "capture_clock": clock_to_wire(message.clock),
+        "localisation": localisation_to_wire(message.localisation),
+    }
+    del values["clock"]
+    return twin_pb2.TwinPicture(**values)
 
 
 def _picture_from_wire(picture: twin_pb2.TwinPicture) -> TwinPicture:
-    return TwinPicture(
+    return same_named(
+        TwinPicture,
+        picture,
         vehicle_id=check_name("picture.vehicle_id", picture.vehicle_id),
         camera_id=check_name("picture.camera_id", picture.camera_id),
-        session_id=picture.session_id,
-        epoch=picture.epoch,
-        sequence=picture.sequence,
-        capture_time_ns=picture.capture_time_ns,
-        age_ns=picture.age_ns,
         pose=pose_from_wire(picture.pose) if picture.HasField("pose") else None,
         intrinsics=intrinsics_from_wire(picture.intrinsics),
-        field_id=picture.field_id,
-        reconstruction_digest=picture.reconstruction_digest,
         encoding=encoding_from_wire(picture.encoding),
-        picture=picture.picture,
-        skipped=picture.skipped,
-        payload_bytes=picture.payload_bytes,
         references=references_from_wire("picture.references", tuple(picture.references)),
         clock=clock_from_wire(picture.capture_clock),
         localisation=localisation_from_wire(picture.localisation),
-        instant=picture.instant,
     )
 
 

@@ -15,7 +15,7 @@ from rfcore.camera import Camera, Intrinsics, TileOrigin
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.field.quality import FULL, Quality
 from rfcore.image import Rgb
-from rfcore.perception.objects import StreetObject
+from rfcore.perception.objects import CameraKey, StreetObject
 from rfcore.wire.checks import (
     check_bytes,
     check_field_id,
@@ -37,6 +37,7 @@ from rfcore.wire.values import (
     pose_to_wire,
     quality_from_wire,
     quality_to_wire,
+    same_named,
 )
 
 __all__ = [
@@ -219,16 +220,7 @@ def rendered_view_to_wire(view: RenderedView) -> pb.RenderResponse:
         picture=view.picture,
         depth_m=view.depth.astype("<f4").tobytes(),
         age_ms=view.age_ms.astype("<u2").tobytes(),
-        cameras=[
-            pb.LiveCamera(
-                vehicle_id=camera.vehicle_id,
-                camera_id=camera.camera_id,
-                age_ms=round(1e3 * camera.age_s),
-                share=camera.share,
-                outvoted=camera.outvoted,
-            )
-            for camera in view.cameras
-        ],
+        cameras=[_live_camera_to_wire(camera) for camera in view.cameras],
     )
 
 
@@ -255,13 +247,19 @@ def rendered_view_from_wire(response: pb.RenderResponse, intrinsics: Intrinsics)
         raise ProtocolError(f"the server sent an impossible view: {error}") from error
 
 
+def _live_camera_to_wire(camera: LiveCamera) -> pb.LiveCamera:
+    values = vars(camera).copy()
+    return pb.LiveCamera(age_ms=round(1e3 * values.pop("age_s")), **values)
+
+
 def _live_camera(camera: pb.LiveCamera) -> LiveCamera:
-    return LiveCamera(
-        check_name("camera.vehicle_id", camera.vehicle_id),
-        check_name("camera.camera_id", camera.camera_id),
-        camera.age_ms / 1e3,
-        check_range("camera.share", camera.share, 0.0, 1.0),
-        camera.outvoted,
+    return same_named(
+        LiveCamera,
+        camera,
+        vehicle_id=check_name("camera.vehicle_id", camera.vehicle_id),
+        camera_id=check_name("camera.camera_id", camera.camera_id),
+        age_s=camera.age_ms / 1e3,
+        share=check_range("camera.share", camera.share, 0.0, 1.0),
     )
 
 
@@ -323,24 +321,24 @@ def _object_from_wire(each: pb.StreetObject) -> StreetObject:
     velocity_mps = (each.velocity_x_mps, each.velocity_y_mps, each.velocity_z_mps)
     for value in (*at_m, *velocity_mps, each.width_m, each.height_m):
         check_range("object", value, -1e9, 1e9)
-    return StreetObject(
-        each.object_id,
-        at_m,
-        velocity_mps,
-        each.width_m,
-        each.height_m,
-        check_range("object.confidence", each.confidence, 0.0, 1.0),
-        each.age_ms / 1e3,
-        each.unseen_ms / 1e3,
-        tuple(
-            (
-                check_name("seen_by.vehicle_id", s.vehicle_id),
-                check_name("seen_by.camera_id", s.camera_id),
-            )
-            for s in each.seen_by
-        ),
-        each.doubtful,
-        check_label("object.label", each.label),
+    return same_named(
+        StreetObject,
+        each,
+        at_m=at_m,
+        velocity_mps=velocity_mps,
+        confidence=check_range("object.confidence", each.confidence, 0.0, 1.0),
+        age_s=each.age_ms / 1e3,
+        unseen_s=each.unseen_ms / 1e3,
+        seen_by=tuple(_camera_key(sighting) for sighting in each.seen_by),
+        is_doubtful=each.doubtful,
+        label=check_label("object.label", each.label),
+    )
+
+
+def _camera_key(sighting: pb.Sighting) -> CameraKey:
+    return (
+        check_name("seen_by.vehicle_id", sighting.vehicle_id),
+        check_name("seen_by.camera_id", sighting.camera_id),
     )
 
 

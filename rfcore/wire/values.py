@@ -6,9 +6,12 @@ decoded by it, so a number that this end does not know, from a newer peer, count
 
 from __future__ import annotations
 
+from dataclasses import fields
 from enum import StrEnum
 from functools import lru_cache
-from typing import Final, cast
+from typing import Any, Final, TypeVar, cast
+
+from google.protobuf.message import Message
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec.references import Reference, References
@@ -31,7 +34,16 @@ __all__ = [
     "quality_to_wire",
     "references_from_wire",
     "references_to_wire",
+    "same_named",
 ]
+
+Value = TypeVar("Value")
+
+
+def same_named(kind: type[Value], message: Message, **others: Any) -> Value:
+    """Return a dataclass whose fields are those of a message by name, but ``others`` as given."""
+    names = [field.name for field in fields(kind) if field.name not in others]  # type: ignore[arg-type]
+    return kind(**{name: getattr(message, name) for name in names}, **others)
 
 
 def intrinsics_to_wire(k: Intrinsics) -> pb.Intrinsics:
