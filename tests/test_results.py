@@ -15,7 +15,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from history import git
 from rfcore.errors import InvalidInput
 from rfedge import results
 from rfedge.results import (
@@ -67,6 +66,10 @@ def _git(checkout: Path, command: str) -> None:
 
 
 # --- what is recorded in results/
+
+
+def git(*arguments: str) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, check=False)
 
 
 def revisions_in(content: object) -> set[str]:

@@ -24,38 +24,19 @@ from rfcore.extras import needs
 from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S, FleetSpec
 from rfedge.loadtest.plan import Load, Vehicles
 from rfedge.loadtest.usage import Usage, Watcher
-from rfedge.loadtest.verdict import Measured, Resources, VehicleCount
+from rfedge.loadtest.verdict import Measured, Resources, VehicleReport
 
 with needs("loadtest"):
     import psutil
 
 __all__ = [
     "RunMeasurements",
-    "VehicleReport",
     "drive_live",
     "drive_prerecorded",
     "links_busy",
     "measured",
     "vehicle_report",
 ]
-
-
-@dataclass(frozen=True)
-class VehicleReport:
-    """One vehicle in the measured part of a run."""
-
-    due: int
-    """Number of pictures that were due."""
-    latency_ms: Sequence[float]
-    """Latencies of the pictures that were acknowledged."""
-    nacked: int = 0
-    """Number of pictures that the server refused."""
-    granted_hz: float = 0.0
-    """Rate that the server admitted; 0: any."""
-    refused: str = ""
-    """Why the server did not admit the vehicle; empty if it did."""
-    failed: str = ""
-    """Why the vehicle lost its stream; empty if it did not."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +76,7 @@ class RunMeasurements:
 
 def measured(load: Load, run: RunMeasurements, link_busy: float, workers: int) -> Measured:
     """Return the measurements to judge: of the admitted vehicles, and how busy everything was."""
-    deadline_ms = load.bounds.deadline_ms
-    counts = [
-        VehicleCount(v.due, sum(ms <= deadline_ms for ms in v.latency_ms), v.latency_ms)
-        for v in run.vehicles
-        if not v.refused
-    ]
+    admitted = [vehicle for vehicle in run.vehicles if not vehicle.refused]
     server = run.usage["server"]
     prerecorded = load.kind is Vehicles.PRERECORDED
     generators = ["vehicles", "links"] if prerecorded else ["links"]
@@ -115,8 +91,8 @@ def measured(load: Load, run: RunMeasurements, link_busy: float, workers: int) -
         others=run.others_cores,
         generator_lag_ms=run.generator_lag_ms,
     )
-    wanted = len(counts) if load.admission else load.vehicles
-    return Measured(counts, wanted, server.growth_mb, server.minutes, resources)
+    wanted = len(admitted) if load.admission else load.vehicles
+    return Measured(admitted, wanted, server.growth_mb, server.minutes, resources)
 
 
 def links_busy(report: Path, load: Load) -> float:

@@ -22,7 +22,7 @@ from rfedge.loadtest.plan import Bounds
 __all__ = [
     "Measured",
     "Resources",
-    "VehicleCount",
+    "VehicleReport",
     "Verdict",
     "judge",
     "limit",
@@ -135,19 +135,32 @@ DEVIATIONS = NormalDist().inv_cdf(0.975)
 
 
 @dataclass(frozen=True)
-class VehicleCount:
-    """Numbers of one vehicle's pictures due and on time, and latencies of those acknowledged."""
+class VehicleReport:
+    """One vehicle in the measured part of a run."""
 
     due: int
-    on_time: int
+    """Number of pictures that were due."""
     latency_ms: Sequence[float]
+    """Latencies of the pictures that were acknowledged."""
+    nacked: int = 0
+    """Number of pictures that the server refused."""
+    granted_hz: float = 0.0
+    """Rate that the server admitted; 0: any."""
+    refused: str = ""
+    """Why the server did not admit the vehicle; empty if it did."""
+    failed: str = ""
+    """Why the vehicle lost its stream; empty if it did not."""
+
+    def on_time(self, deadline_ms: float) -> int:
+        """Return how many pictures were acknowledged within the deadline."""
+        return sum(ms <= deadline_ms for ms in self.latency_ms)
 
 
 @dataclass(frozen=True)
 class Measured:
     """The measurements of one run that are judged."""
 
-    vehicles: Sequence[VehicleCount]
+    vehicles: Sequence[VehicleReport]
     wanted_vehicles: int
     growth_mb: float
     """Growth of the server's memory over ``minutes``."""
@@ -177,11 +190,11 @@ class Verdict:
 def judge(measured: Measured, bounds: Bounds) -> Verdict:
     """Compare a run with its bounds."""
     due = sum(vehicle.due for vehicle in measured.vehicles)
-    on_time = sum(vehicle.on_time for vehicle in measured.vehicles)
+    on_time = sum(vehicle.on_time(bounds.deadline_ms) for vehicle in measured.vehicles)
     latency_ms = [ms for vehicle in measured.vehicles for ms in vehicle.latency_ms]
     p50_ms, p99_ms = _percentiles(latency_ms)
     percent = 100.0 * on_time / due if due else 0.0
-    fairness = _fairness(measured.vehicles)
+    fairness = _fairness(measured.vehicles, bounds.deadline_ms)
     allowed_mb = bounds.settling_mb + bounds.growth_mb_per_minute * measured.minutes
     checks = (
         (
@@ -231,8 +244,8 @@ def _percentiles(latency_ms: Sequence[float]) -> tuple[float, float]:
     return float(p50_ms), float(p99_ms)
 
 
-def _fairness(vehicles: Sequence[VehicleCount]) -> float:
+def _fairness(vehicles: Sequence[VehicleReport], deadline_ms: float) -> float:
     """Return the worst vehicle's share on time over the best one's."""
-    shares = [vehicle.on_time / vehicle.due for vehicle in vehicles if vehicle.due]
+    shares = [vehicle.on_time(deadline_ms) / vehicle.due for vehicle in vehicles if vehicle.due]
     best = max(shares, default=0.0)
     return min(shares) / best if best else 0.0

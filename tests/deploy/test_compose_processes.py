@@ -1,31 +1,19 @@
 """Without Docker the compose file's commands run as they stand; only their places differ."""
 
-import importlib.util
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-ROOT = Path(__file__).parents[2]
+from scripts import ROOT, loaded
+
 ENV = dict(re.findall(r"^(\w+)=(.*)$", (ROOT / ".env").read_text(), re.MULTILINE))
 
 
-def loaded() -> Any:
-    path = ROOT / "deploy/compose/processes.py"
-    spec = importlib.util.spec_from_file_location("compose_processes", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-processes = loaded()
+processes = loaded("deploy/compose/processes.py")
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 SERVICES = processes.read_services(COMPOSE, ENV)
 LOCATIONS = processes.locations_of(SERVICES, Path("/run/demo"))

@@ -40,9 +40,9 @@ def pods() -> dict[str, dict[str, Any]]:
 def test_every_resource_is_valid_to_the_letter(version: str) -> None:
     from kubernetes_validate import validate
 
-    kinds = [document["kind"] for document in documents()]
-    assert len(kinds) == 10
-    for document in documents():
+    resources = documents()
+    assert resources
+    for document in resources:
         validate(document, version, strict=True)
 
 

@@ -1,41 +1,29 @@
-"""What is installed where: every set of packages is pinned with hashes, and names no index."""
+"""Every set of packages is pinned with hashes, and names no index."""
 
-import importlib.util
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-ROOT = Path(__file__).parents[2]
+from scripts import ROOT, loaded
 
-
-def script(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / f"deploy/{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-SCRIPT = script("requirements")
+SCRIPT = loaded("deploy/requirements.py")
 SETS: tuple[str, ...] = tuple(SCRIPT.SETS)
 
 
 def wanted(name: str) -> dict[str, Requirement]:
-    """What pyproject.toml asks for, by normalised name."""
+    """Return the requirements of pyproject.toml, by normalised name."""
     lines = [Requirement(line) for line in SCRIPT.requirements(name, ROOT)]
     return {canonicalize_name(requirement.name): requirement for requirement in lines}
 
 
 def pins(name: str) -> dict[str, str]:
-    """Version of each package in requirements/NAME.txt."""
+    """Return the version of each package in requirements/NAME.txt."""
     text = (ROOT / f"requirements/{name}.txt").read_text(encoding="utf-8")
     found = re.findall(r"^([A-Za-z0-9._-]+)==([^ ;\\\n]+)", text, flags=re.MULTILINE)
     return {canonicalize_name(package): version for package, version in found}
@@ -112,7 +100,7 @@ STEPS = (
     *("build-full", "check", "docs", "test", "test-slow"),
     *("test-asan", "fuzz", "test-fault-core", "soak-short"),
 )
-"""What CI does on each push."""
+"""Steps of CI on each push."""
 
 
 def ledger(tmp_path: Path, makefile: str) -> subprocess.CompletedProcess[str]:
@@ -162,7 +150,7 @@ def test_ci_runs_failed_tests_alone_once_more_and_names_them(
     assert done.returncode == (outcome == "FAILED")
 
 
-WHEELS = script("wheels")
+WHEELS = loaded("deploy/wheels.py")
 
 
 def test_wheels_are_built_for_an_interpreter_that_is_named(tmp_path: Path) -> None:

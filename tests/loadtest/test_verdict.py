@@ -6,16 +6,24 @@ from dataclasses import replace
 import pytest
 
 from rfedge.loadtest.plan import Bounds
-from rfedge.loadtest.verdict import Measured, Resources, VehicleCount, judge, share_at_least
+from rfedge.loadtest.verdict import (
+    Measured,
+    Resources,
+    VehicleReport,
+    judge,
+    limit,
+    nearest,
+    share_at_least,
+)
 
 IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.0, 1.0)
 
 
-def vehicle(on_time: int, due: int = 100, ms: float = 20.0) -> VehicleCount:
-    return VehicleCount(due, on_time, [ms] * on_time)
+def vehicle(on_time: int, due: int = 100, ms: float = 20.0) -> VehicleReport:
+    return VehicleReport(due, [ms] * on_time)
 
 
-def run_of(*vehicles: VehicleCount, growth_mb: float = 0.0) -> Measured:
+def run_of(*vehicles: VehicleReport, growth_mb: float = 0.0) -> Measured:
     return Measured(vehicles, len(vehicles), growth_mb, 1.0, IDLE)
 
 
@@ -57,7 +65,7 @@ def test_a_broken_bound_is_named(measured: Measured, said: str) -> None:
 
 
 def test_pictures_that_never_came_count_against_the_share() -> None:
-    verdict = judge(run_of(VehicleCount(100, 90, [5.0] * 90)), Bounds())
+    verdict = judge(run_of(VehicleReport(100, [5.0] * 90)), Bounds())
     assert verdict.on_time_percent == 90.0
     assert verdict.p99_ms == 5.0, "of those acknowledged"
 
@@ -69,3 +77,54 @@ def test_what_others_use_is_the_limit_only_where_a_bound_was_broken() -> None:
     assert judge(held, Bounds()).limited_by == "nearest: server's event loop, at 60 % of a core"
     said = "CPU of the machine, at 100 %, 1.4 cores of it by others"
     assert judge(broken, Bounds()).limited_by == said
+
+
+# --- the resource that is named
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"server_loop": 0.98}, "server's event loop, at 98 % of a core"),
+        ({"workers": 0.9}, "server's workers, at 90 %"),
+        ({"link": 0.9}, "link of the busiest vehicle, at 90 %"),
+        ({"machine": 0.97}, "CPU of the machine, at 97 %"),
+        (
+            {"machine": 0.97, "others": 0.5},
+            "CPU of the machine, at 97 %, 0.5 cores of it by others",
+        ),
+        ({"generator": 0.9, "server_loop": 0.98}, "vehicles of the test, at 90 % of a core"),
+        ({"generator_lag_ms": 25.0}, "vehicles of the test, 25 ms late themselves"),
+        ({"generator_lag_ms": 25.0, "machine": 0.99}, "CPU of the machine, at 99 %"),
+    ],
+)
+def test_the_resource_at_its_limit_is_named(change: dict[str, float], named: str) -> None:
+    assert limit(replace(IDLE, **change)) == named
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({}, "nearest: CPU of the machine, at 20 %"),
+        ({"server_loop": 0.6, "machine": 0.65}, "nearest: server's event loop, at 60 % of a core"),
+        ({"workers": 0.84, "machine": 0.9}, "nearest: server's workers, at 84 %"),
+    ],
+)
+def test_without_one_at_its_limit_the_nearest_is_named(
+    change: dict[str, float], named: str
+) -> None:
+    assert limit(replace(IDLE, **change)) == named
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"machine": 1.0, "others": 1.6}, "nearest: CPU of the machine, at 20 %"),
+        ({"machine": 1.0, "test": 0.8}, "nearest: CPU of the machine, at 80 %"),
+        ({"machine": 1.0, "workers": 0.5}, "nearest: server's workers, at 50 %"),
+    ],
+)
+def test_a_held_load_is_nearest_to_a_limit_by_its_own_use(
+    change: dict[str, float], named: str
+) -> None:
+    assert nearest(replace(IDLE, **change)) == named
