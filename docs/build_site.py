@@ -84,7 +84,6 @@ FILES: Mapping[str, str] = {
     "Rigs of cameras: `rig.toml`": "rfcore.dataset.rig",
     "Links: `rfedge link --profile`": "rfcore.link.plan",
     "Access to a server: `mec-server --access`": "mec_server.access",
-    "Streets: `streetgen build`": "streetgen.scene_file",
 }
 VARIABLES = {
     "RFEDGE_TWIN_TOKEN": "The token of `rfedge twin --http`, which no list of processes shows.",
@@ -156,7 +155,8 @@ def command_pages() -> Mapping[str, str]:
 def _sections(name: str, parse: Parse, words: Sequence[str]) -> Iterator[str]:
     head, panels = read_help(help_text(parse, words))
     usage, _, text = head.partition("\n\n")
-    usage = re.sub(r"\s+", " ", usage.removeprefix("usage: "))
+    usage = re.sub(r"\s+", " ", usage.removeprefix("usage: ")).replace("[-h] ", "")
+    usage = re.sub(r"\{[\w,-]+\}$", "COMMAND", usage)
     if words:
         yield f"## {name} {' '.join(words)}\n"
     yield f"```text\n{usage}\n```\n\n{escaped(text.strip())}\n"
@@ -167,10 +167,18 @@ def _sections(name: str, parse: Parse, words: Sequence[str]) -> Iterator[str]:
             continue
         items = [item for item in panel.items if item[0] != "-h, --help"]
         if items:
-            yield f"**{panel.title}** {escaped(panel.introduction)}\n"
-            yield table(("option", "what it does"), ((code(t), escaped(d)) for t, d in items))
+            if panel.introduction:
+                yield f"{escaped(panel.introduction)}\n"
+            kind = "argument" if panel.title == "positional arguments" else "option"
+            yield table((kind, "what it does"), (_option(*item) for item in items))
     for verb, _ in verbs:
         yield from _sections(name, parse, [*words, verb])
+
+
+def _option(name: str, text: str) -> Sequence[str]:
+    """Return a row for an option, without defaults that say nothing."""
+    text = re.sub(r" ?\(default: (None|False|True|''|)\)$", "", text)
+    return code(name.replace("{None}|", "")), escaped(text)
 
 
 def escaped(text: str) -> str:
@@ -289,6 +297,7 @@ def collect(folder: Path = BUILD) -> None:
         file = folder / "reference" / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")
+    shutil.copy(ROOT / "streetgen" / "README.md", folder / "reference" / "streets.md")
     for page in sorted(RESULTS.glob("*.md")):
         (folder / "results").mkdir(exist_ok=True)
         shutil.copy(page, folder / "results" / page.name)
@@ -299,8 +308,9 @@ def collect(folder: Path = BUILD) -> None:
 
 
 def on_site(text: str) -> str:
-    """Return a page whose links to recorded results lead to where the site has them."""
+    """Return a page whose links out of ``docs`` lead to where the site has those pages."""
     text = re.sub(r"\]\((\.\./)+lab/results/", "](../results/", text)
+    text = re.sub(r"\]\((\.\./)+streetgen/README\.md", "](../reference/streets.md", text)
     return text.replace("<details>", '<details markdown="1">')
 
 

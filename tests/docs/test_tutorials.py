@@ -106,8 +106,8 @@ def test_pictures_become_a_field_and_saved_bits(tmp_path: Path) -> None:
     ]
     assert saved
     assert max(saved) < -30, "a field of the very street saves bits"
-    for shown in ("x264-our-tools", "best of any CPU", "rfedge-without-field"):
-        assert shown.replace(" ", "") in re.sub(r"[\s│┃]", "", said)
+    for shown in ("x264-our-tools", "(best of", "rfedge-without-field"):
+        assert shown in said, "a row that the page explains"
 
 
 @pytest.fixture
