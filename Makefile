@@ -87,13 +87,11 @@ test-system-packages:  ## install the programs that test-slow uses (root, Debian
 CHOICE = $(if $(RESUME),--resume) $(if $(ONLY),-k "$(ONLY)")
 test-fault: build-full test-system-packages  ## break servers, vehicles and links; records it (root)
 	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json lab/results/faults.json $(CHOICE)
-	$(BIN)/python -m lab.pages.faults lab/results/faults.json > docs/reliability.md.part
-	mv docs/reliability.md.part docs/reliability.md
+	$(MAKE) figures
 
 test-attack: build-full test-system-packages  ## attack a server under compose's limits; records it (root)
 	$(BIN)/python -m pytest tests/attack -m attack --timeout 180 --attacks-json lab/results/attacks.json $(CHOICE)
-	$(BIN)/python -m lab.pages.attacks lab/results/attacks.json > docs/attacks.md.part
-	mv docs/attacks.md.part docs/attacks.md
+	$(MAKE) figures
 
 # The most telling ones: a server and a decoder that die, packets that are damaged, renders for nothing;
 # on a small street, and at street size: the shipped field, 640x360. Chosen by a mark: where one

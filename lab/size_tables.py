@@ -13,9 +13,9 @@ from tyro.conf import Positional
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfedge.arguments import field_path, parse_size
-from rfedge.evaluate.cells import CellStore
+from rfedge.evaluate import Experiment
 from rfedge.evaluate.clips import DriveName
-from rfedge.results import check_result_path, make_result, provenance, write_result
+from rfedge.evaluate.runner import Run
 from rfedge.samples import sample_path
 from rfedge.sizing.measure import MIN_FRAMES, SETTLED_FRAMES, measured_cells, read_sized_drive
 from rfedge.sizing.tables import SizingCell
@@ -44,8 +44,8 @@ class Footage:
         return self.drive.rate_hz / self.step
 
 
-@dataclass(frozen=True)
-class EvalSizing:
+@dataclass(frozen=True, kw_only=True)
+class EvalSizing(Experiment):
     """Measure the tables of `rfedge size`: bytes and processor time by size, rate and quality.
 
     Goes on where it was stopped, cell by cell.
@@ -59,36 +59,25 @@ class EvalSizing:
     sizes: tuple[str, ...] = ("320x180", "640x360", "1920x1080")
     """WIDTHxHEIGHT that the pictures are reduced to, as far as a drive is that large."""
     out: Path = Path("out/eval/sizing.json")
-    """The result file to write."""
     cells: Path = Path("out/eval/sizing")
-    """Folder of finished pieces."""
-    quick: bool = False
-    """Five frames at the drives' own rates: to see that it works, not for figures."""
 
     def run(self) -> None:
         """Measure what is not there yet and write the tables."""
         self.measure(Console())
 
     def measure(self, console: Console) -> dict[str, Any]:
-        """Measure what is not there yet, write ``out`` and return it."""
-        check_result_path(self.out)
+        """Measure what is not there yet, write the result and return it."""
         path = field_path(self.field)
-        field, store, made = load_field(path), CellStore(self.cells), provenance([path])
+        run, field = Run.begin("sizing", self, [path], console), load_field(path)
         cells: list[SizingCell] = []
         for footage in self.planned():
             (width_px, height_px), step = footage.size_px, footage.step
-            console.print(f"  {width_px}x{height_px} at {footage.hz:g} Hz: {footage.frames} frames")
+            run.tell(f"  {width_px}x{height_px} at {footage.hz:g} Hz: {footage.frames} frames")
             drive = read_sized_drive(footage.drive, footage.size_px, footage.frames * step)
-            cells += measured_cells(drive.every(step), field, store)
+            cells += measured_cells(drive.every(step), field, run.store)
         streets = ", ".join(f"{name.scene} at {name.rate_hz:g} Hz" for name in self._names())
-        content = {
-            "measured_on": f"{streets}; field {field.field_id[:12]}",
-            "quick": self.quick,
-            "cells": cells,
-        }
-        result = make_result("sizing", made, content)
-        write_result(self.out, result)
-        return result
+        measured_on = f"{streets}; field {field.field_id[:12]}"
+        return run.finish({"measured_on": measured_on, "cells": cells}, lambda _: ())
 
     def planned(self) -> list[Footage]:
         """Return each size and rate once, of the drive that has most frames of it."""

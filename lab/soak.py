@@ -1,4 +1,4 @@
-"""A long run at half load: nothing may grow. ``python -m lab.soak --minutes 30``
+"""Check that nothing grows in a long run at half load: ``python -m lab.soak --minutes 30``.
 
 Two prerecorded vehicles at 5 Hz put half the load on ``mec-server`` that it must hold on two cores.
 Its memory must grow by less than 1 MB a minute (least squares over the counted part), the least
@@ -13,29 +13,30 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
+from lab.report import Report
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.run import Run, TestBed, run_load
 from rfedge.loadtest.usage import Sample
-from rfedge.report.tables import cell, heading, table
-from rfedge.results import Result, make_result, provenance, rows_of, write_result
+from rfedge.report.tables import Table, named_columns
+from rfedge.results import Result, make_result, provenance, write_result
 from rfedge.samples import sample_path
 
 __all__ = [
     "MAX_SLOPE_MB",
+    "REPORT",
     "SoakRow",
     "SoakSettings",
     "slope_per_minute",
     "soak",
-    "soak_section",
     "what_grew",
 ]
 
@@ -118,11 +119,16 @@ def soak(settings: SoakSettings) -> dict[str, Any]:
     return result
 
 
-def soak_section(path: Path, result: Result) -> str:
-    """Return a table of the soaks."""
-    columns = [each.name for each in fields(SoakRow)]
-    rows = [[*map(cell, astuple(row))] for row in rows_of(SoakRow, result["rows"])]
-    return "\n\n".join([heading(path, result), table(columns, rows), ""])
+def _parts(result: Result) -> Iterator[Table | str]:
+    yield Table("", named_columns(each.name for each in fields(SoakRow)), result["rows"])
+
+
+REPORT = Report(
+    "soak",
+    "A long run at half load",
+    "Whether memory, descriptors and threads of a server grow while it works for long.",
+    _parts,
+)
 
 
 def _command() -> str:

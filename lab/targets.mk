@@ -6,20 +6,16 @@
 results results-full: build-full  ## record anew what takes two hours, or everything (DATA)
 	$(MAKE) -f lab/results/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
 
+results-%: build-full  ## record `rfedge-lab NAME` in lab/results/NAME.json (ARGS)
+	$(BIN)/rfedge-lab $* $(ARGS) --out lab/results/$*.json
+
 figures: build-full  ## make the pages and figures of the recorded results
-	$(BIN)/python -m lab.pages.results lab/results docs README.md
-	$(BIN)/python -m rfedge.evaluate.ladder.page lab/results docs
-	$(BIN)/python -m lab.pages.faults lab/results/faults.json > docs/reliability.md.part
-	mv docs/reliability.md.part docs/reliability.md
-	if test -f lab/results/attacks.json; then \
-		$(BIN)/python -m lab.pages.attacks lab/results/attacks.json > docs/attacks.md.part && \
-		mv docs/attacks.md.part docs/attacks.md; fi
-	$(BIN)/python -m lab.pages.sizing > docs/sizing.md.part
-	mv docs/sizing.md.part docs/sizing.md
+	$(BIN)/python -m lab.pages
 
 stability: build-full  ## run the hard cases and record them
 	$(BIN)/python -m pytest tests/hard/test_stability.py::test_the_case_holds \
-		--stability-json lab/results/stability.json --stability-page docs/stability.md
+		--stability-json lab/results/stability.json
+	$(MAKE) figures
 
 bench: build-full  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge-lab bench raster

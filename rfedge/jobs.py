@@ -1,48 +1,144 @@
-"""Lists of jobs that make files: one after another in this process, or at the same time on Ray.
+"""Jobs that run one after another, in local processes or on Ray, and what they leave on disk.
 
-A job is named, can be pickled, and depends on nothing but what it was made from, threads included:
-its files have the same bytes wherever it runs. A job whose files are there, made from the same, is
-skipped; the file ``FIRST_OUTPUT.job`` beside them says from what. (One that does not say what it is
-made from is done each time, and looks itself for what is there.) What it writes is whole or not
-there at all (``rfcore.files``), so a job whose process was killed is begun again, and goes on where
-it left a checkpoint. One that fails does not stop the others.
+A finished piece of work is a ``Cell``: a JSON file that holds the key of everything its result
+depends on, and the result. Files appear whole or not at all (``rfcore.files``), so a run that was
+stopped goes on where it was.
+
+A ``Job`` is named, can be pickled, and depends on nothing but what it was made from, threads
+included: its files have the same bytes wherever it runs. A cell beside its first output says what
+the outputs were made from; a job whose outputs are there, made from the same, is skipped. A job
+that does not say what it is made from is done each time, and looks itself for cells that are there.
+A job whose process was killed is begun again, and goes on where it left a checkpoint. A job that
+fails does not stop the others.
 
 On Ray all machines must have this version of rfedge and see the same folders at the same paths.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import os
 import socket
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
+from multiprocessing import get_context
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 from rich.console import Console
 
-from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.errors import InvalidData, InvalidInput, RfedgeError
 from rfcore.extras import needs
 from rfcore.files import write_whole
 from rfcore.wire.address import Address
 
-__all__ = ["Job", "Tell", "console_of", "run_jobs"]
+__all__ = [
+    "Cell",
+    "CellKey",
+    "CellStore",
+    "Job",
+    "Rows",
+    "Tell",
+    "check_processes",
+    "console_of",
+    "run_jobs",
+]
 
 Tell = Callable[[str], None]
 """Takes a line about how a job goes."""
+CellKey = Mapping[str, str | float | int | None]
+Rows = list[dict[str, Any]]
 LOCAL = "local"
 RETRIES = 3
 """How often a job is begun again whose process was killed."""
+MOST_PROCESSES = 256
 POLL_S = 0.2
 REACHED_WITHIN_S = 10.0
 OBJECT_STORE_BYTES = 100 << 20
-"""Of a Ray started here: jobs hand over files, not objects."""
+"""Memory for objects of a Ray that is started here: jobs hand over files, not objects."""
 LINE_COLUMNS = 200
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A file that holds a result with the key of all that it depends on."""
+
+    path: Path
+    key: CellKey
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the file is there and was made from this key."""
+        try:
+            self.result()
+        except (OSError, InvalidData):
+            return False
+        return True
+
+    def result(self) -> Any:
+        """Return the result; raise ``InvalidData`` naming a file that is damaged."""
+        try:
+            stored = json.loads(self.path.read_text(encoding="utf-8"))
+            if stored["key"] != dict(self.key):
+                raise ValueError("it was made for another key")
+            return stored["result"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise self.damaged(error) from error
+
+    def keep(self, result: object) -> None:
+        """Write the file, and the folder that it belongs in."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        content = json.dumps({"key": dict(self.key), "result": result}, indent=1)
+        write_whole(self.path, content + "\n")
+
+    def forget(self) -> None:
+        """Remove the file if there is one."""
+        self.path.unlink(missing_ok=True)
+
+    def damaged(self, why: object) -> InvalidData:
+        """Return the error for a file that cannot be used."""
+        return InvalidData(f"{self.path}: not a finished cell ({why}); delete it to redo it")
+
+
+@dataclass(frozen=True)
+class CellStore:
+    """A folder of cells, each in a file named by the digest of its key."""
+
+    folder: Path
+
+    def cell(self, key: CellKey) -> Cell:
+        """Return the cell of ``key``, whether it is there or not."""
+        canonical = json.dumps(dict(key), sort_keys=True, allow_nan=False)
+        name = hashlib.sha256(canonical.encode()).hexdigest()[:32]
+        return Cell(self.folder / f"{name}.json", key)
+
+    def has(self, key: CellKey) -> bool:
+        """Return whether the cell of ``key`` is there already."""
+        return self.cell(key).path.exists()
+
+    def rows(self, key: CellKey, make: Callable[[], Rows]) -> Rows:
+        """Return the rows of ``key``, from the folder or made by ``make`` and then kept.
+
+        Raises ``InvalidData`` naming the file if the cell is damaged.
+        """
+        cell = self.cell(key)
+        if not cell.path.exists():
+            rows = make()
+            cell.keep(rows)
+            return rows
+        stored = cell.result()
+        if not isinstance(stored, list):
+            raise cell.damaged("it holds no rows")
+        return stored
 
 
 @dataclass(frozen=True)
@@ -52,11 +148,11 @@ class Job:
     name: str
     work: Callable[[Tell], None]
     """Makes the files; a function of a module, or a partial of one, since it is pickled."""
-    outputs: tuple[Path, ...]
-    made_from: str | None
+    outputs: tuple[Path, ...] = ()
+    made_from: str | None = None
     """All that the files' bytes depend on, in one line; None: it is done each time."""
-    cores: int
-    memory_bytes: int
+    cores: int = 1
+    memory_bytes: int = 2_000_000_000
 
     def __post_init__(self) -> None:
         if not self.outputs and self.made_from is not None:
@@ -67,31 +163,29 @@ class Job:
     @property
     def is_done(self) -> bool:
         """Whether the files are there, made from the same."""
+        marker = self._marker
+        return marker is not None and marker.is_kept and all(map(Path.exists, self.outputs))
+
+    @property
+    def _marker(self) -> Cell | None:
+        """The cell that says what the outputs were made from."""
         if self.made_from is None:
-            return False
-        if not all(path.exists() for path in (self._marker, *self.outputs)):
-            return False
-        return self._marker.read_text(encoding="utf-8") == self._mark
-
-    @property
-    def _marker(self) -> Path:
-        return self.outputs[0].with_name(f"{self.outputs[0].name}.job")
-
-    @property
-    def _mark(self) -> str:
-        return f"{self.made_from}\n"
+            return None
+        first = self.outputs[0]
+        return Cell(first.with_name(f"{first.name}.job"), {"made from": self.made_from})
 
     def run(self, tell: Tell) -> str | None:
         """Make the files; return None, or what went wrong."""
+        marker = self._marker
         try:
-            if self.made_from is not None:
-                self._marker.unlink(missing_ok=True)
+            if marker is not None:
+                marker.forget()
             self.work(tell)
             missing = [str(path) for path in self.outputs if not path.exists()]
             if missing:
                 return f"did not write {', '.join(missing)}"
-            if self.made_from is not None:
-                write_whole(self._marker, self._mark)
+            if marker is not None:
+                marker.keep(None)
         except (RfedgeError, OSError) as error:
             return str(error)
         except Exception as error:
@@ -100,14 +194,24 @@ class Job:
         return None
 
 
-def run_jobs(jobs: Sequence[Job], tell: Tell, ray_address: str | None = None) -> int:
+def check_processes(processes: int) -> None:
+    """Raise ``InvalidInput`` for a number of processes that ``run_jobs`` does not start."""
+    if not 1 <= processes <= MOST_PROCESSES:
+        raise InvalidInput("processes", f"{processes} is outside 1..{MOST_PROCESSES}")
+
+
+def run_jobs(
+    jobs: Sequence[Job], tell: Tell, ray_address: str | None = None, processes: int = 1
+) -> int:
     """Do the jobs that are not done yet; return how many were done before.
 
-    Without ``ray_address`` here, one after another; with it on the Ray at that address, ``local``
-    starting one with this machine's cores. Every line of every job goes to ``tell``, with the job's
-    name and its process. Raises ``InvalidInput`` for two jobs of one name, ``RfedgeError`` at the
+    They run here one after another, or ``processes`` of them at a time in processes of their own;
+    with ``ray_address`` on the Ray at that address, ``local`` starting one with this machine's
+    cores. Every line of every job goes to ``tell`` with the job's name and its process; local
+    processes print theirs. Raises ``InvalidInput`` for two jobs of one name, ``RfedgeError`` at the
     end naming the jobs that failed and why, ``BackendUnavailable`` without Ray.
     """
+    check_processes(processes)
     names = [job.name for job in jobs]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -116,7 +220,12 @@ def run_jobs(jobs: Sequence[Job], tell: Tell, ray_address: str | None = None) ->
     for job in jobs:
         if job not in waiting:
             tell(f"{job.name}: done before")
-    ended = _run_here(waiting, tell) if ray_address is None else _on_ray(waiting, tell, ray_address)
+    if ray_address is not None:
+        ended = _on_ray(waiting, tell, ray_address)
+    elif processes > 1:
+        ended = _in_processes(waiting, processes)
+    else:
+        ended = ((job, _run_telling(job, tell)) for job in waiting)
     failed = []
     for job, problem in ended:
         tell(f"{job.name}: {'done' if problem is None else f'failed: {problem}'}")
@@ -128,13 +237,23 @@ def run_jobs(jobs: Sequence[Job], tell: Tell, ray_address: str | None = None) ->
     return len(jobs) - len(waiting)
 
 
-def _run_here(jobs: Sequence[Job], tell: Tell) -> Iterator[tuple[Job, str | None]]:
-    for job in jobs:
-        yield job, _run_telling(job, tell)
+def _in_processes(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, str | None]]:
+    """Run jobs in processes of this machine; yield each when it has ended."""
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        running = {pool.submit(_run_printing, job): job for job in jobs}
+        for ended in as_completed(running):
+            try:
+                yield running[ended], ended.result()
+            except BrokenProcessPool as error:
+                yield running[ended], f"its process was killed: {error}"
+
+
+def _run_printing(job: Job) -> str | None:
+    return _run_telling(job, partial(print, flush=True))
 
 
 def _run_telling(job: Job, tell: Tell) -> str | None:
-    """Run a job whose lines say whose they are."""
+    """Run a job; put its name and its process before each of its lines."""
     process = os.getpid()
 
     def tell_of_job(text: str) -> None:
@@ -148,7 +267,7 @@ def _run_telling(job: Job, tell: Tell) -> str | None:
 
 
 class _Lines:
-    """Holds the lines of all workers until they are taken: an actor of Ray."""
+    """An actor of Ray that holds the lines of all workers until they are taken."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
@@ -157,7 +276,7 @@ class _Lines:
         self._lines.append(line)
 
     def have_arrived(self) -> bool:
-        """Be called last: the calls of one caller are taken in their order."""
+        """Return once the caller's earlier calls were taken: Ray keeps their order."""
         return True
 
     def take(self) -> list[str]:
@@ -213,7 +332,7 @@ def _outcome(ray: Any, task: Any) -> str | None:
 
 
 def _too_large(job: Job, machines: Sequence[dict[str, float]]) -> str | None:
-    """Say why a job would wait for ever, or None where a machine is large enough for it."""
+    """Return why a job would wait for ever, or None if some machine is large enough for it."""
     for machine in machines:
         if job.cores <= machine.get("CPU", 0) and job.memory_bytes <= machine.get("memory", 0):
             return None
@@ -272,7 +391,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 class _Telling(io.StringIO):
-    """A text stream whose whole lines are told."""
+    """A text stream that passes each whole line to ``tell``."""
 
     def __init__(self, tell: Tell) -> None:
         super().__init__()
@@ -286,5 +405,5 @@ class _Telling(io.StringIO):
 
 
 def console_of(tell: Tell) -> Console:
-    """Return a console without colours whose lines are told."""
+    """Return a console without colours that passes its lines to ``tell``."""
     return Console(file=_Telling(tell), width=LINE_COLUMNS, force_terminal=False, soft_wrap=True)

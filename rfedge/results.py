@@ -50,7 +50,7 @@ Result = Mapping[str, Any]
 T = TypeVar("T")
 
 CHECKOUT = Path(__file__).parents[1]
-CODE = (".", ":!results", ":!docs")
+CODE = (".", ":!lab/results", ":!docs")
 """Git pathspecs of the files that decide about a figure."""
 DIRTY = "-dirty"
 NUMBERS = re.compile(r"\[\n\s*(?:(?:-?\d[\d.eE+-]*|null),?\n\s*)+\]")

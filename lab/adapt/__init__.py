@@ -8,15 +8,15 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from rfcore.codec.h264.config import DEFAULT_EFFORT
-from rfedge.arguments import JSON
-from rfedge.evaluate.compare import Preset
+from rfcore.codec.h264.config import DEFAULT_EFFORT, check_effort
+from rfcore.errors import InvalidInput
+from rfedge.evaluate import Experiment, Preset
 
 __all__ = ["EvalAdapt"]
 
 
-@dataclass(frozen=True)
-class EvalAdapt:
+@dataclass(frozen=True, kw_only=True)
+class EvalAdapt(Experiment):
     """Compare, at 33 dB, a drive in another light with the noon that the field shows.
 
     Stopped and started again, it goes on where it was.
@@ -28,22 +28,22 @@ class EvalAdapt:
     layer of another variant, as in learnt=dusk.rff, or learnt:2=dusk.rff if from two passes,
     learnt:3/2=dusk.rff if from three passes of two vehicles."""
     effort: str = DEFAULT_EFFORT
-    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
+    """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: Preset = "medium"
     """Preset of the rival, x264 tuned for PSNR."""
-    out: Annotated[Path, JSON] = Path("out/eval/adapt.json")
-    """The result file to write."""
+    out: Path = Path("out/eval/adapt.json")
     cells: Path = Path("out/eval/adapt")
-    """Folder of finished pieces."""
-    quick: bool = False
-    """Six frames of each drive: to see that it works, not for figures."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_effort("effort", self.effort)
+        if not self.cases:
+            raise InvalidInput("cases", "there is none")
 
     def run(self) -> None:
-        """Code what is not there yet and write the rows."""
+        """Code what is not there yet, write the rows and print them."""
         from rich.console import Console
 
-        from lab.adapt.measure import AdaptCase, AdaptJob, run_adapt
+        from lab.adapt.measure import run_adapt
 
-        cases = tuple(AdaptCase.parse(text) for text in self.cases)
-        job = AdaptJob(cases, self.effort, self.preset, self.out, self.cells, self.quick)
-        run_adapt(job, Console())
+        run_adapt(self, Console())

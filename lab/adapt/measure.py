@@ -1,13 +1,13 @@
-"""Bits that another light costs, and which of them each way of adapting to it wins back.
+"""What another light costs in bits, and how much of it each way of adapting wins back.
 
-A variant is how a drive is coded: ``off``, with the field as it is; ``matrix``, with the sender's
+A *variant* is how a drive is coded: ``off``, with the field as it is; ``matrix``, with the sender's
 matrix of colours (``rfcore.codec.photometric``) wherever it chooses to send one; ``auto``, as
 vehicles do it: with renders under the light of the frame before (``rfcore.native.warp``) wherever
 that pays, else a matrix; and any field or colour layer that the case names. With b the bits at
-33 dB, ``recovered_percent`` is 100 (b_off - b) / (b_off - b_noon), b_noon being those of the same
-drive in the field's own light. A field that shows more than 33 dB before a bit is sent has no such
-b: its bits at the coarsest point are more than enough, an upper bound, and what it recovers is at
-least what that bound does. At 36 dB every curve has bits.
+33 dB, ``recovered_percent`` is 100 (b_off - b) / (b_off - b_noon), where b_noon are those of the
+same drive in the field's own light. A field that shows more than 33 dB before a bit is sent has no
+such b: its bits at the coarsest point are an upper bound, and the share that it recovers is a lower
+bound. At 36 dB every curve has bits.
 
 In the right light the sender adapts nothing: ``messages_differ`` compares whole messages with those
 of ``off``, byte for byte and at every rate.
@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from dataclasses import field as with_factory
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -28,34 +27,27 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from rfcore.codec.h264.config import check_effort
+from lab.adapt import EvalAdapt
+from lab.report import Report, bars
 from rfcore.codec.photometric import Photometric, adapt, solve
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfcore.image import I420
 from rfcore.native.warp import relight_i420
-from rfedge.evaluate.cells import CellStore, program_version
 from rfedge.evaluate.clips import STEADY, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.performance import Performance, perform
 from rfedge.evaluate.rate_curve import rate_curve
 from rfedge.evaluate.rivals import x264_for_psnr
-from rfedge.report.tables import heading, print_table, table
-from rfedge.results import (
-    Result,
-    check_result_path,
-    make_result,
-    provenance,
-    rows_of,
-    write_result,
-)
+from rfedge.evaluate.runner import Run, program_version
+from rfedge.report.tables import Column, Table, columns, shown
+from rfedge.results import Result, rows_of
 
 __all__ = [
     "AT_DB",
+    "REPORT",
     "AdaptCase",
-    "AdaptJob",
     "AdaptRow",
-    "adapt_section",
     "drives_to_break_even",
     "kbit_at",
     "messages_differ",
@@ -69,7 +61,7 @@ __all__ = [
 AT_DB = 33.0
 FINER_DB = 36.0
 LEAST_LOSS = 0.1
-"""Of the bits in the field's own light: shares of a smaller loss say nothing."""
+"""Smallest loss, as a share of the bits in the field's own light, that shares are taken of."""
 FIRST = slice(0, 1)
 POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
 QUICK_FRAMES = 6
@@ -80,76 +72,103 @@ TOOLS: Mapping[str, tuple[Photometric | None, bool | None]] = {
     MATRIX: (None, False),
     AUTO: (None, None),
 }
-"""Variants with the case's own field, and what the sender is told about the light: the numbers, and
-whether to relight; None: where that pays."""
+"""Variants with the case's own field. Each has what the sender is told about the light: the numbers
+of the matrix, and whether to relight; None leaves it to the sender."""
+
+
+def _bounded_percent(value: float | None, row: AdaptRow, sign: str) -> str | None:
+    """Return a percentage; where 33 dB has only a bound, with the sign that says so."""
+    if value is None:
+        return None
+    return f"{sign if row.kbit_33db_at_most is not None else ''}{value:+.1f}"
 
 
 @dataclass(frozen=True)
 class AdaptRow:
     """One drive coded in one way; None where a figure does not apply."""
 
-    case: str
-    drive: str
-    frames: int
-    variant: str
+    case: str = field(metadata=shown("case"))
+    drive: str = field(metadata=shown("drive"))
+    frames: int = field(metadata=shown("frames"))
+    variant: str = field(metadata=shown("variant"))
     kbit_33db: float | None
-    """Kilobits a frame at a luma PSNR of 33 dB, the first frame apart."""
-    lowest_psnr_db: float
+    """Kilobits a frame at a luma PSNR of 33 dB, without the first frame."""
+    lowest_psnr_db: float = field(metadata=shown("lowest dB", ".1f"))
     """Luma PSNR at the fewest bits: above 33 dB, ``kbit_33db`` is None."""
-    x264_kbit_33db: float | None
+    x264_kbit_33db: float | None = field(metadata=shown("x264 kbit at 33 dB", ".1f"))
     """Kilobits of x264 tuned for PSNR at 33 dB."""
     recovered_percent: float | None
-    """Of what the drive costs more than in the field's own light, with the variant ``off``."""
-    noon_bits_percent: float | None
-    """Bits more than ``off`` takes in the field's own light; other fields are not taken there."""
-    second_vehicle_percent: float | None
+    """Share won back of what ``off`` costs more than in the field's own light."""
+    noon_bits_percent: float | None = field(metadata=shown("more bits at noon, %", "+.1f"))
+    """Bits above those of ``off`` in the field's own light; only of tools."""
+    second_vehicle_percent: float | None = field(metadata=shown("second vehicle %", "+.1f"))
     """Bits above those of the street without what is new to the field, over those that ``off``
     takes above them; of fields that were learnt since."""
-    side_bytes: int
-    """Of the field or layer that the variant needs besides."""
-    extra_ms: float | None
-    """Processor time a frame of an end for the tool alone: relighting a render (``auto``), solving
-    for and applying the matrix (``matrix``); medians of a run in which they take turns, whether
-    the frame pays or not. None for fields, which cost nothing besides."""
+    side_bytes: int = field(metadata=shown("side bytes"))
+    """Size of the field or layer that the variant needs besides."""
+    extra_ms: float | None = field(metadata=shown("extra ms", "+.1f"))
+    """Processor time a frame that one end takes for the tool alone, whether the frame pays or not;
+    a median of runs in which the tools take turns. Fields take none."""
     kbit_33db_at_most: float | None = None
     """Kilobits at the fewest bits, where those show more than 33 dB already."""
-    kbit_36db: float | None = None
-    recovered_36db_percent: float | None = None
-    passes: int | None = None
-    """From how many passes the variant's field was learnt."""
-    identities: int | None = None
-    """Of how many vehicles those were."""
-    drives_to_break_even: float | None = None
-    """Of this drive, until the bits saved at 33 dB are those of the field or layer."""
-    messages_differ: int | None = None
-    """Of a tool: messages that are not those of ``off``, of all frames at all rates."""
-    noon_messages_differ: int | None = None
+    kbit_36db: float | None = field(default=None, metadata=shown("kbit at 36 dB", ".1f"))
+    recovered_36db_percent: float | None = field(
+        default=None, metadata=shown("recovered at 36 dB, %", ".1f")
+    )
+    passes: int | None = field(default=None, metadata=shown("passes"))
+    """Number of passes that the variant's field was learnt from."""
+    identities: int | None = field(default=None, metadata=shown("vehicles"))
+    """Number of vehicles that drove them."""
+    drives_to_break_even: float | None = field(
+        default=None, metadata=shown("drives to break even", ".1f")
+    )
+    """Number of drives like this one after which the bits saved at 33 dB are those of the field."""
+    messages_differ: int | None = field(default=None, metadata=shown("messages that differ"))
+    """Messages of a tool that are not those of ``off``, of all frames at all rates."""
+    noon_messages_differ: int | None = field(default=None, metadata=shown("differ at noon"))
     """The same in the field's own light."""
-    relit_frames: int | None = None
+    relit_frames: int | None = field(default=None, metadata=shown("relit frames"))
     """Frames under the light of the one before, or under one that was sent, at the rate nearest to
     33 dB."""
-    switches: int | None = None
+    switches: int | None = field(default=None, metadata=shown("switches"))
     """How often frames begin or cease to be relit there."""
-    first_kbit_33db: float | None = None
+    first_kbit_33db: float | None = field(
+        default=None, metadata=shown("first frame, kbit at 33 dB", ".1f")
+    )
     """Kilobits of the first frame where it has 33 dB itself."""
+
+    @property
+    def enough_kbit(self) -> float | None:
+        """Kilobits a frame that are enough for 33 dB."""
+        return self.kbit_33db if self.kbit_33db_at_most is None else self.kbit_33db_at_most
+
+    @property
+    def kbit_text(self) -> str | None:
+        """The same with what it is against x264, and whether it is a bound."""
+        if self.enough_kbit is None:
+            return None
+        sign = "" if self.kbit_33db_at_most is None else "≤ "
+        percent = _more_percent(self.x264_kbit_33db, self.enough_kbit)
+        against = "" if percent is None else f" ({percent:+.1f} %)"
+        return f"{sign}{self.enough_kbit:.1f}{against}"
 
 
 @dataclass(frozen=True)
 class AdaptCase:
     """A drive in some light, the field of another one, and variants by name.
 
-    ``noon``: the same drive in the field's light; ``empty``: without what the field has not seen;
-    ``passes``: how many passes a variant's field was learnt from, ``identities``: of how many
-    vehicles those were, where the case says so.
+    ``noon`` is the same drive in the field's light, ``empty`` the one without what the field has
+    not seen. ``passes`` says from how many passes a variant's field was learnt, ``identities`` how
+    many vehicles drove them, where the case says so.
     """
 
     drive: DriveName
-    field: Path
+    own: Path
     noon: Path | None = None
     empty: Path | None = None
-    variants: Mapping[str, Path] = with_factory(default_factory=dict)
-    passes: Mapping[str, int] = with_factory(default_factory=dict)
-    identities: Mapping[str, int] = with_factory(default_factory=dict)
+    variants: Mapping[str, Path] = field(default_factory=dict)
+    passes: Mapping[str, int] = field(default_factory=dict)
+    identities: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def parse(text: str) -> AdaptCase:
@@ -183,7 +202,7 @@ class AdaptCase:
     @property
     def files(self) -> list[Path]:
         """Everything the case reads as one file."""
-        return [self.field, *self.variants.values()]
+        return [self.own, *self.variants.values()]
 
 
 def _vehicles(pair: str, vehicles: int, passes: int) -> int:
@@ -193,43 +212,19 @@ def _vehicles(pair: str, vehicles: int, passes: int) -> int:
     return vehicles
 
 
-@dataclass(frozen=True)
-class AdaptJob:
-    """What to run; see ``rfedge-lab adapt --help``."""
-
-    cases: Sequence[AdaptCase]
-    effort: str
-    preset: str
-    out: Path
-    cells: Path
-    quick: bool = False
-
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-        check_effort("effort", self.effort)
-        if not self.cases:
-            raise InvalidInput("cases", "there is none")
-
-    def read(self, name: DriveName) -> Drive:
-        """Return a drive's frames, the first few of them where it is to be quick."""
-        return read_drive(name, QUICK_FRAMES if self.quick else None)
-
-
-def run_adapt(job: AdaptJob, console: Console) -> dict[str, Any]:
-    """Code what is not there yet, write ``job.out`` and print the rows.
+def run_adapt(job: EvalAdapt, console: Console) -> dict[str, Any]:
+    """Code what is not there yet, write the result and print its rows.
 
     Raises ``DatasetError`` or ``FieldFormatError`` for inputs that cannot be read.
     """
-    made = provenance([path for case in job.cases for path in case.files])
-    store, rows = CellStore(job.cells), []
-    for case in job.cases:
-        for row in _Measured(job, case, store).rows():
+    cases = [AdaptCase.parse(text) for text in job.cases]
+    run = Run.begin("adapt", job, [path for case in cases for path in case.files], console)
+    rows = []
+    for case in cases:
+        for row in _CaseMeasuring(job, case, run).rows():
             rows.append(row)
-            console.print(f"{row.case} {row.variant}: {_kbit_text(row)}")
-    result = make_result("adapt", made, {"quick": job.quick, "at_db": AT_DB, "rows": rows})
-    write_result(job.out, result)
-    print_table(console, "Another light", COLUMNS, [_cells(row) for row in rows])
-    return result
+            run.tell(f"{row.case} {row.variant}: {_kbit_line(row)}")
+    return run.finish({"at_db": AT_DB, "rows": rows}, _parts)
 
 
 def recovered_percent(
@@ -253,26 +248,28 @@ def second_vehicle_percent(
 
 
 @dataclass(frozen=True)
-class _Measured:
-    job: AdaptJob
+class _CaseMeasuring:
+    """What every variant of one case is measured with."""
+
+    job: EvalAdapt
     case: AdaptCase
-    store: CellStore
+    run: Run
 
     def rows(self) -> Iterator[AdaptRow]:
         """Yield a row for each variant."""
-        case, drive = self.case, self.job.read(self.case.drive)
+        case, drive = self.case, self._read(self.case.drive)
         x264_kbit = kbit_at(AT_DB, self._performed(drive, x264_for_psnr(self.job.preset)))
-        plain = self._coded(drive, OFF, case.field)
+        plain = self._coded(drive, OFF, case.own)
         noon, empty = self._other("noon", case.noon), self._other("empty", case.empty)
-        noon_plain = None if noon is None else self._coded(noon, OFF, case.field)
+        noon_plain = None if noon is None else self._coded(noon, OFF, case.own)
         noon_kbit, empty_off = _kbit_of(noon_plain), self._off_kbit(empty)
         extra_ms = self._tool_ms(drive)
         for variant in (*TOOLS, *case.variants):
             path = case.variants.get(variant)
-            done = plain if variant == OFF else self._coded(drive, variant, path or case.field)
+            done = plain if variant == OFF else self._coded(drive, variant, path or case.own)
             noon_done = None
             if noon is not None and path is None:
-                noon_done = self._coded(noon, variant, case.field)
+                noon_done = self._coded(noon, variant, case.own)
             off_kbit, kbit, at_most = kbit_at(AT_DB, plain), kbit_at(AT_DB, done), most_kbit(done)
             enough = kbit if at_most is None else at_most
             side_bytes = 0 if path is None else path.stat().st_size
@@ -315,33 +312,36 @@ class _Measured:
                 first_kbit_33db=kbit_at(AT_DB, done, FIRST),
             )
 
+    def _read(self, name: DriveName) -> Drive:
+        return read_drive(name, QUICK_FRAMES if self.job.quick else None)
+
     def _tool_ms(self, drive: Drive) -> Mapping[str, float]:
         """Return the processor time a frame of each tool, measured once and kept."""
         key = {
             "scene": drive.name.scene,
             "frames": drive.digest,
-            "field": load_field(self.case.field).field_id,
+            "field": load_field(self.case.own).field_id,
             "times": program_version(),
         }
 
         def make() -> list[dict[str, Any]]:
-            rendered = render_clip(load_field(self.case.field), drive.cameras)
+            rendered = render_clip(load_field(self.case.own), drive.cameras)
             return [tool_ms(drive.frames, rendered.renders)]
 
-        return self.store.rows(key, make)[0]
+        return self.run.store.rows(key, make)[0]
 
     def _other(self, kind: str, dataset: Path | None) -> Drive | None:
         """Return the same drive in other circumstances, if the case names it."""
         if dataset is None:
             return None
         drive = self.case.drive
-        return self.job.read(DriveName(f"{drive.scene}-{kind}", drive.rate_hz, dataset))
+        return self._read(DriveName(f"{drive.scene}-{kind}", drive.rate_hz, dataset))
 
     def _off_kbit(self, drive: Drive | None) -> float | None:
         """Return what a drive takes with the case's own field."""
         if drive is None:
             return None
-        return kbit_at(AT_DB, self._coded(drive, OFF, self.case.field))
+        return kbit_at(AT_DB, self._coded(drive, OFF, self.case.own))
 
     def _coded(self, drive: Drive, variant: str, path: Path) -> Performance:
         rendered = render_clip(load_field(path), drive.cameras)
@@ -358,7 +358,7 @@ class _Measured:
         return self._performed(drive, coder)
 
     def _performed(self, drive: Drive, coder: Any) -> Performance:
-        return perform(drive.clip(), coder, self.store)
+        return perform(drive.clip(), coder, self.run.store)
 
 
 def _kbit_of(done: Performance | None, psnr_db: float = AT_DB) -> float | None:
@@ -429,92 +429,44 @@ def kbit_at(psnr_db: float, done: Performance, frames: slice = STEADY) -> float 
     return 8e-3 * rate_curve(done.clips, frames).bytes_at(psnr_db)
 
 
-COLUMNS = (
-    "case",
-    "drive",
-    "frames",
-    "variant",
-    "kbit at 33 dB",
-    "lowest dB",
-    "x264",
-    "against x264 %",
-    "recovered %",
-    "bits at noon %",
-    "second vehicle %",
-    "side bytes",
-    "extra ms",
-)
-LATER_COLUMNS: Mapping[str, Callable[[AdaptRow], object]] = {
-    "kbit at 36 dB": lambda row: row.kbit_36db,
-    "recovered at 36 dB %": lambda row: row.recovered_36db_percent,
-    "passes": lambda row: row.passes,
-    "vehicles": lambda row: row.identities,
-    "drives to break even": lambda row: row.drives_to_break_even,
-    "messages that differ": lambda row: row.messages_differ,
-    "at noon": lambda row: row.noon_messages_differ,
-    "relit frames": lambda row: row.relit_frames,
-    "switches": lambda row: row.switches,
-    "first kbit at 33 dB": lambda row: row.first_kbit_33db,
-}
-"""Left out of the page where no row has them, as in results of before."""
-
-
-def adapt_section(path: Path, result: Result) -> str:
-    """Return the table of the results page."""
+def _parts(result: Result) -> Iterator[Table | str]:
     rows = rows_of(AdaptRow, result["rows"])
-    later = {
-        name: value
-        for name, value in LATER_COLUMNS.items()
-        if any(value(row) is not None for row in rows)
-    }
-    cells = [[*_cells(row), *(_later(value(row)) for value in later.values())] for row in rows]
-    return "\n\n".join([heading(path, result), table((*COLUMNS, *later), cells), ""])
+    same = ("case", "variant")
+    kbit = Column("kbit a frame at 33 dB (against x264)", lambda row: row.kbit_text)
+    recovered = Column(
+        "recovered %", lambda row: _bounded_percent(row.recovered_percent, row, "≥ ")
+    )
+    bits = (kbit, recovered, "kbit_36db", "recovered_36db_percent", "second_vehicle_percent")
+    yield Table("Bits", columns(AdaptRow, *same, *bits), rows)
+    takes = ("side_bytes", "passes", "identities", "drives_to_break_even", "extra_ms")
+    yield Table("What the variants take", columns(AdaptRow, *same, *takes), rows)
+    sent = ("messages_differ", "noon_messages_differ", "noon_bits_percent")
+    relit = ("relit_frames", "switches")
+    yield Table("What is sent", columns(AdaptRow, *same, *sent, *relit), rows)
+    drive = ("drive", "frames", "lowest_psnr_db", "x264_kbit_33db", "first_kbit_33db")
+    yield Table("The drives", columns(AdaptRow, *same, *drive), rows)
 
 
-def _later(value: object) -> str:
-    if value is None:
-        return "n/a"
-    return f"{value:.1f}" if isinstance(value, float) else str(value)
+def _bars(result: Result) -> Iterator[tuple[str, float]]:
+    for row in rows_of(AdaptRow, result["rows"]):
+        if row.enough_kbit is not None:
+            yield f"{row.case} {row.variant}", row.enough_kbit
 
 
-def _cells(row: AdaptRow) -> list[str]:
-    bound = row.kbit_33db_at_most
-    enough = row.kbit_33db if bound is None else bound
-    against = _more_percent(row.x264_kbit_33db, enough)
-    is_bound = bound is not None
-    return [
-        row.case,
-        row.drive,
-        str(row.frames),
-        row.variant,
-        _at("≤ ", is_bound, _kbit(enough)),
-        f"{row.lowest_psnr_db:.1f}",
-        _kbit(row.x264_kbit_33db),
-        _at("≤ ", is_bound, _percent(against)),
-        _at("≥ ", is_bound, _percent(row.recovered_percent)),
-        _percent(row.noon_bits_percent),
-        _percent(row.second_vehicle_percent),
-        str(row.side_bytes),
-        "n/a" if row.extra_ms is None else f"{row.extra_ms:+.1f}",
-    ]
+REPORT = Report(
+    "adapt",
+    "Another light",
+    "What a drive costs in another light than the field's, and how much of that each way of "
+    "adapting to it wins back.",
+    _parts,
+    bars("kbit a frame at 33 dB", _bars),
+)
 
 
-def _at(sign: str, is_bound: bool, text: str) -> str:
-    return f"{sign}{text}" if is_bound and text != "n/a" else text
-
-
-def _kbit_text(row: AdaptRow) -> str:
+def _kbit_line(row: AdaptRow) -> str:
     if row.kbit_33db is not None:
         return f"{row.kbit_33db:.1f} kbit a frame"
     if row.kbit_33db_at_most is not None:
         most, from_db = row.kbit_33db_at_most, row.lowest_psnr_db
         return f"at most {most:.1f} kbit a frame: not at {AT_DB:g} dB, from {from_db:.1f} dB on"
     return f"not at {AT_DB:g} dB, from {row.lowest_psnr_db:.1f} dB on"
-
-
-def _kbit(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.1f}"
-
-
-def _percent(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:+.1f}"

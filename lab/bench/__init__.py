@@ -17,7 +17,7 @@ from rfcore.errors import InvalidInput
 from rfedge.arguments import FIELD, field_path
 from rfedge.results import Result, make_result, provenance, write_result
 
-__all__ = ["CASES", "Bench", "Rows", "bench_section", "flattened", "print_rows", "run_case"]
+__all__ = ["CASES", "Bench", "Rows", "print_rows", "run_case"]
 
 CASES = ("raster", "train", "codec", "ngp", "decoders")
 Rows = Literal["all", "native", "modes"]
@@ -113,29 +113,9 @@ def print_rows(result: Result) -> None:
     """Print the rows of a result as a table."""
     from rich.console import Console
 
-    from rfedge.report.tables import print_table
+    from rfedge.report.tables import Table, named_columns
 
     host = result["host"]
     title = f"{result['case']} at {result['revision']} on {host['cpu']} ({host['isa']})"
     rows = [flattened(row) for row in result["rows"]]
-    columns = list(rows[0])
-    cells = [[_cell(row[column]) for column in columns] for row in rows]
-    print_table(Console(), title, columns, cells)
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def bench_section(path: Path, result: Result) -> str:
-    """Return the rows as a section of the results page."""
-    from rfedge.report.tables import cell, heading, table
-
-    rows = [flattened(row) for row in result["rows"]]
-    if not rows:
-        raise InvalidInput("result", f"{path} has no rows")
-    columns = list(rows[0])
-    cells = [[cell(row[column]) for column in columns] for row in rows]
-    return "\n\n".join([heading(path, result), table(columns, cells), ""])
+    Table(title, named_columns(rows[0]), rows).print(Console())

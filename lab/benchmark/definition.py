@@ -13,8 +13,8 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -23,12 +23,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from lab.report import Report, bars
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.files import write_whole
 from rfcore.tables import Range, Table
 from rfedge.evaluate.clips import Clip, CodedClip, Drive, DriveName, read_drive
 from rfedge.evaluate.compare.measure import break_even_row
-from rfedge.evaluate.compare.report import BreakEvenRow
+from rfedge.evaluate.compare.rows import BreakEvenRow
 from rfedge.evaluate.performance import Performance
 from rfedge.evaluate.rate_curve import (
     RateCurve,
@@ -38,21 +39,23 @@ from rfedge.evaluate.rate_curve import (
     rate_curve,
 )
 from rfedge.evaluate.rivals import Rival
-from rfedge.report.tables import heading, print_table, table
+from rfedge.report.tables import Column, columns, shown
+from rfedge.report.tables import Table as ScoreTable
 from rfedge.results import Result, rows_of
 from rfedge.samples import sample_path
 
 __all__ = [
+    "REPORT",
     "V1",
     "Benchmark",
     "BenchmarkDrive",
     "BenchmarkRow",
     "Scoring",
-    "benchmark_section",
     "described",
     "print_scores",
     "read_benchmark",
     "record_anchors",
+    "score_parts",
     "score_rows",
 ]
 
@@ -301,19 +304,21 @@ def _clips_of(rows: Sequence[Mapping[str, Any]], drives: Sequence[BenchmarkDrive
 class BenchmarkRow:
     """A submission against one anchor over one window of luma PSNR, on one drive."""
 
-    scene: str
-    hz: float
+    scene: str = field(metadata=shown("drive"))
+    hz: float = field(metadata=shown("Hz", "g"))
     method: str
-    rival: str
+    rival: str = field(metadata=shown("anchor"))
     window_db: Window
-    bd_rate_percent: float
-    """Of all frames but the first; negative where the method needs fewer bytes."""
-    ci95: Sequence[float] | None
-    """None where curves of resampled frames leave the window."""
-    bd_rate_with_first_percent: float | None
-    """Of all frames; None where a curve with the first frame does not span the window."""
+    bd_rate_percent: float = field(metadata=shown("BD-rate %", "+.1f"))
+    """BD-rate over all frames but the first; negative if the method needs fewer bytes."""
+    ci95: Sequence[float] | None = field(metadata=shown("95 %", "{:.1f}..{:.1f}", "n/a"))
+    """None if curves of resampled frames leave the window."""
+    bd_rate_with_first_percent: float | None = field(
+        metadata=shown("with frame 0, %", "+.1f", "n/a")
+    )
+    """BD-rate over all frames; None if a curve with the first frame does not span the window."""
     first_frame_bytes: int
-    """At the point nearest to the middle of the window, as the SSIM."""
+    """Size at the point nearest to the middle of the window, as the SSIM."""
     rival_first_frame_bytes: int
     ssim: float
     rival_ssim: float
@@ -402,26 +407,48 @@ def _interval(
         return None
 
 
-COLUMNS = ("drive", "Hz", "anchor", "dB", "BD-rate %", "95 %", "with frame 0 %", "first frame kB")
+WINDOW = Column("dB", lambda row: row.window_db, "{:g}..{:g}")
+FIRST_FRAME = Column(
+    "first frame kB",
+    lambda row: (row.first_frame_bytes / 1e3, row.rival_first_frame_bytes / 1e3),
+    "{:.1f} ({:.1f})",
+)
+
+
+def score_parts(result: Result) -> Iterator[ScoreTable | str]:
+    """Yield a checked submission's rows, what its prior costs, and what was not checked."""
+    rows = rows_of(BenchmarkRow, result["rows"])
+    shown_columns = columns(BenchmarkRow, "scene", "hz", "rival", WINDOW, *FIGURES, FIRST_FRAME)
+    title = f"{result['submission']['method']}: {result['benchmark']}"
+    yield ScoreTable(title, shown_columns, rows)
+    yield "\n".join(f"* {line}" for line in _remarks(result))
+
+
+FIGURES = ("bd_rate_percent", "ci95", "bd_rate_with_first_percent")
+
+
+def _bars(result: Result) -> Iterator[tuple[str, float]]:
+    for row in rows_of(BenchmarkRow, result["rows"]):
+        if row.window_db == result["rows"][0]["window_db"]:
+            yield f"{row.scene}: {row.rival}", row.bd_rate_percent
+
+
+REPORT = Report(
+    "benchmark",
+    "rfedge-bench v1",
+    "What our codec scores in the frozen benchmark that anybody's codec can be handed in to.",
+    score_parts,
+    bars("BD-rate against the anchor, %", _bars),
+)
 
 
 def print_scores(console: Console, result: Result) -> None:
-    """Print a checked submission's rows of the first window, what its prior costs, and what was
-    not checked."""
-    rows = rows_of(BenchmarkRow, result["rows"])
-    headline = [_cells(row) for row in rows if row.window_db == rows[0].window_db]
-    title = f"{result['submission']['method']}: {result['benchmark']}"
-    print_table(console, title, COLUMNS, headline)
-    for line in _remarks(result):
-        console.print(line, markup=False, highlight=False)
-
-
-def benchmark_section(path: Path, result: Result) -> str:
-    """Return a submission's section of the results page: all windows, what was not checked."""
-    rows = [_cells(row) for row in rows_of(BenchmarkRow, result["rows"])]
-    about = f"`{result['submission']['method']}` in {result['benchmark']}:"
-    remarks = "\n".join(f"* {line}" for line in _remarks(result))
-    return "\n\n".join([heading(path, result), about, table(COLUMNS, rows), remarks, ""])
+    """Print a checked submission's scores, and what was not checked."""
+    for part in score_parts(result):
+        if isinstance(part, ScoreTable):
+            part.print(console)
+        else:
+            console.print(part, markup=False, highlight=False)
 
 
 def _remarks(result: Result) -> list[str]:
@@ -431,21 +458,6 @@ def _remarks(result: Result) -> list[str]:
         paid = "is never paid for" if passes is None else f"is paid for by {passes} passes"
         lines.append(f"{row.scene}: the prior of {row.field_bytes:,} bytes {paid}.")
     return lines + [f"Not checked: {what}." for what in result["not_checked"]]
-
-
-def _cells(row: BenchmarkRow) -> list[str]:
-    low, high = row.window_db
-    with_first = row.bd_rate_with_first_percent
-    return [
-        row.scene,
-        f"{row.hz:g}",
-        row.rival,
-        f"{low:g}..{high:g}",
-        f"{row.bd_rate_percent:.1f}",
-        "n/a" if row.ci95 is None else "{:.1f}..{:.1f}".format(*row.ci95),
-        "n/a" if with_first is None else f"{with_first:.1f}",
-        f"{row.first_frame_bytes / 1e3:.1f} ({row.rival_first_frame_bytes / 1e3:.1f})",
-    ]
 
 
 def described(benchmark: Benchmark) -> str:

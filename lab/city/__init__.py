@@ -27,8 +27,6 @@ class PlanCity:
     """The city to plan, of which it says everything (see samples/sizing/city.toml)."""
     fcd: Annotated[Path | None, arg(metavar="FILE.xml[.gz]")] = None
     """Its vehicles: FCD output of SUMO, in place of the stated demand."""
-    sumo: Annotated[Path | None, arg(metavar="FILE.sumocfg")] = None
-    """Its vehicles: this simulation, run here; needs rfedge[sumo]."""
     step_s: float = 1.0
     """Seconds between the steps of its stated demand."""
     samples: int = 9
@@ -57,8 +55,7 @@ class PlanCity:
         costs = costs_of(city, shipped_tables())
         plan = plan_city(city, costs, self._traffic(city))
         checks = check_plan(plan, check)
-        inputs = (self.city, self.fcd, self.sumo)
-        made = provenance([path for path in inputs if path is not None])
+        made = provenance([self.city, *([self.fcd] if self.fcd else [])])
         result = write_city(self.out, made, self.city.stem, plan, checks)
         if self.json is not None:
             write_result(self.json, result)
@@ -68,15 +65,8 @@ class PlanCity:
             Console().print(f"  {self.out / name}")
 
     def _traffic(self, city: City) -> Iterator[TrafficBlock]:
-        from lab.city.traffic import stated_traffic, sumo_traffic, trace_traffic
-        from rfcore.errors import InvalidInput
-        from rfcore.extras import require
+        from lab.city.traffic import stated_traffic, trace_traffic
 
-        if self.fcd is not None and self.sumo is not None:
-            raise InvalidInput("sumo", "--fcd is a simulation that was run; give one of them")
         if self.fcd is not None:
             return trace_traffic(city, self.fcd)
-        if self.sumo is not None:
-            require("sumo", "libsumo")
-            return sumo_traffic(city, self.sumo)
         return stated_traffic(city, self.step_s)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from rfcore.files import write_whole
-from rfedge.report.tables import print_table
+from rfedge.report.tables import text_table
 from rfedge.results import Provenance, Result, as_json, make_result, write_result
 
 if TYPE_CHECKING:
@@ -54,14 +54,15 @@ def print_city(console: Console, plan: CityPlan, checks: Sequence[CheckRow]) -> 
         [row.limit, f"{row.share:.2f}", row.where, _clock(row.at_s), _broken(row.broken_at_s)]
         for row in plan.limits
     ]
-    print_table(console, "", ("limit", "asked", "where", "when", "broken from"), limits)
+    heads = ("limit", "asked", "where", "when", "broken from")
+    text_table(heads, limits).print(console)
     if checks:
         cells = [
             [name, f"{median:.1f}", f"{largest:.1f}"]
             for name, median, largest in largest_differences(checks)
         ]
         title = "Flow model against sessions, difference in %"
-        print_table(console, title, ("figure", "median", "largest"), cells)
+        text_table(("figure", "median", "largest"), cells, title).print(console)
 
 
 def _broken(at_s: float | None) -> str:

@@ -1,6 +1,6 @@
-"""Vehicles in the cells of a city over time: of a stated density, or of SUMO.
+"""Vehicles in the cells of a city over time: of a stated density, or of a trace of SUMO.
 
-Each is an iterator of ``TrafficBlock``s, a minute each, so that a day of a city takes no memory.
+Both are an iterator of ``TrafficBlock``s, a minute each, so that a day of a city takes no memory.
 
 Of a density, crossings follow the fluid flow model of mobility (Thomas, Gilbert, Mazziotto 1988):
 from an area of perimeter L and surface A that n vehicles of mean speed v cross in any direction,
@@ -14,8 +14,7 @@ A trace is SUMO's FCD output (``sumo --fcd-output FILE``), XML, also as .gz, rea
       </timestep>
 
 ``x`` and ``y`` are metres in the network's frame, which has to be that of the cells; an output in
-degrees (``--fcd-output.geo``) cannot be used. Persons are not counted. A simulation that is stepped
-here (extra ``sumo``) has the same moments, without the file: those of a step bear its beginning.
+degrees (``--fcd-output.geo``) cannot be used. Persons are not counted.
 """
 
 from __future__ import annotations
@@ -26,9 +25,8 @@ import zlib
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 from xml.parsers.expat import ExpatError, ParserCreate
 
 import numpy as np
@@ -36,14 +34,12 @@ from numpy.typing import NDArray
 
 from lab.city.city import Cells, City, Density, Floats
 from rfcore.errors import InvalidData, InvalidInput
-from rfcore.extras import needs
 
 __all__ = [
     "INTERVAL_S",
     "CellMap",
     "TrafficBlock",
     "stated_traffic",
-    "sumo_traffic",
     "trace_traffic",
 ]
 
@@ -320,48 +316,6 @@ def trace_traffic(city: City, path: Path) -> Iterator[TrafficBlock]:
     for a trace that has nobody in any cell; ``OSError`` for a file that cannot be read.
     """
     return _counted(city, path, _moments(path))
-
-
-def sumo_traffic(city: City, path: Path) -> Iterator[TrafficBlock]:
-    """Yield the traffic of a simulation of SUMO (.sumocfg), stepped to its end.
-
-    Raises ``InvalidData`` with what SUMO says of a simulation that it cannot run, and where nobody
-    is in any cell; ``BackendUnavailable`` without libsumo, whose state is the process's own: one
-    simulation runs at a time.
-    """
-    return _counted(city, path, _stepped(path))
-
-
-def _stepped(path: Path) -> Iterator[Positions]:
-    with needs("sumo"):
-        libsumo = import_module("libsumo")
-    try:
-        libsumo.start(["sumo", "--configuration-file", str(path), "--no-step-log"])
-        yield from _steps(libsumo)
-    except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-        raise InvalidData(f"{path}: SUMO does not run it, it says why above: {error}") from None
-    finally:
-        libsumo.close()
-
-
-def _steps(libsumo: Any) -> Iterator[Positions]:
-    """Yield everybody after each step, as the FCD output has them: at the time it began."""
-    simulation, vehicle = libsumo.simulation, libsumo.vehicle
-    end_s, step_s = simulation.getEndTime(), simulation.getDeltaT()
-    known: dict[str, int] = {}
-    while _goes_on(simulation, end_s):
-        simulation.step()
-        names = vehicle.getIDList()
-        numbers = np.array([known.setdefault(name, len(known)) for name in names], dtype=np.int64)
-        points_m = np.array([vehicle.getPosition(name) for name in names], dtype=np.float64)
-        yield Positions(simulation.getTime() - step_s, numbers, points_m.reshape(-1, 2))
-
-
-def _goes_on(simulation: Any, end_s: float) -> bool:
-    """Return whether a step is left: up to the stated end, or while vehicles are to come."""
-    if end_s >= 0:
-        return bool(simulation.getTime() < end_s)
-    return bool(simulation.getMinExpectedNumber() > 0)
 
 
 def _counted(city: City, path: Path, moments: Iterator[Positions]) -> Iterator[TrafficBlock]:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional
 
-from rfcore.codec.h264.config import DEFAULT_EFFORT
-from rfedge.evaluate.compare import Preset
+from rfcore.codec.h264.config import DEFAULT_EFFORT, check_effort
+from rfcore.errors import InvalidInput
+from rfedge.evaluate import Experiment, Preset
 
 __all__ = ["EvalClasses"]
 
 
-@dataclass(frozen=True)
-class EvalClasses:
+@dataclass(frozen=True, kw_only=True)
+class EvalClasses(Experiment):
     """PSNR of each class of things, ours and low-delay x264's, at equal bits and equal quality.
 
     Class pictures are those that `streetgen build` puts beside the drive's pictures. Prints what
@@ -31,31 +32,25 @@ class EvalClasses:
     at_db: tuple[float, ...] = (33.5,)
     """Luma PSNR of the whole picture. Equal bits are those that ours needs for it."""
     effort: str = DEFAULT_EFFORT
-    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
+    """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: Preset = "medium"
     """x264 preset of the rivals."""
     out: Path = Path("out/eval/classes.json")
-    """The result file to write."""
     cells: Path = Path("out/eval/classes")
-    """Folder of finished pieces."""
-    quick: bool = False
-    """Eight frames of each drive: to see that it works, not for figures."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_effort("effort", self.effort)
+        if not self.drives:
+            raise InvalidInput("drives", "there is none")
+        if not self.at_db or not all(0 < db < 100 for db in self.at_db):
+            raise InvalidInput("at_db", f"{self.at_db} are not decibels within 0..100")
 
     def run(self) -> None:
-        """Run what is not there yet and write the rows."""
+        """Run what is not there yet, write the rows and print them."""
         from rich.console import Console
 
-        from lab.classes.measure import ClassesJob, run_classes
+        from lab.classes.measure import run_classes
         from rfedge.arguments import field_path
 
-        job = ClassesJob(
-            field=field_path(self.field),
-            drives=self.drives,
-            at_db=self.at_db,
-            effort=self.effort,
-            preset=self.preset,
-            out=self.out,
-            cells=self.cells,
-            quick=self.quick,
-        )
-        run_classes(job, Console())
+        run_classes(replace(self, field=field_path(self.field)), Console())

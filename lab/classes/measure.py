@@ -1,4 +1,4 @@
-"""Quality by class: what vehicles, people, signs and markings look like where averages agree.
+"""Measure quality by class: how vehicles, people, signs and markings look at equal averages.
 
 A frame's PSNR is an average in which the road, the sky and the facades outweigh what a twin is for.
 Here the squared error of the luma is summed over the pixels of each class, over all frames but the
@@ -11,21 +11,20 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import chain
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from rfcore.codec.h264.config import check_effort
+from lab.classes import EvalClasses
+from lab.report import Report, bars
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
 from rfcore.image import I420
-from rfedge.evaluate.cells import CellStore, clip_key, program_version
 from rfedge.evaluate.clips import (
     STEADY,
     Clip,
@@ -40,15 +39,10 @@ from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.performance import perform, seconds_left
 from rfedge.evaluate.picture_quality import luma_ssim
 from rfedge.evaluate.rivals import CodedPictures, x264_lowdelay, x264_with_our_tools
-from rfedge.report.tables import heading, print_table, table
-from rfedge.results import (
-    Result,
-    check_result_path,
-    make_result,
-    provenance,
-    rows_of,
-    write_result,
-)
+from rfedge.evaluate.runner import Run, coded_clip, program_version
+from rfedge.jobs import CellStore
+from rfedge.report.tables import Table, text_table
+from rfedge.results import Result, rows_of
 from streetgen.classes import Label, class_picture_of, read_classes
 
 with needs("eval"):
@@ -56,10 +50,9 @@ with needs("eval"):
 
 __all__ = [
     "GROUPS",
+    "REPORT",
     "ClassCoder",
     "ClassQuality",
-    "ClassesJob",
-    "classes_section",
     "quality_at",
     "read_groups",
     "run_classes",
@@ -67,7 +60,7 @@ __all__ = [
 
 GROUPS = ("rest", "vehicle", "person", "sign", "marking")
 ALL = "all"
-"""Named as a class: the whole picture."""
+"""The class of the whole picture."""
 GROUP_OF = {
     Label.VEHICLE: "vehicle",
     Label.PERSON: "person",
@@ -137,22 +130,22 @@ class ClassCoder:
 
     @property
     def name(self) -> str:
-        """The coder's."""
+        """The coder's own."""
         return self.coder.name
 
     @property
     def points(self) -> Sequence[float]:
-        """The coder's."""
+        """The coder's own."""
         return self.coder.points
 
     @property
     def limits(self) -> tuple[float, float]:
-        """The coder's."""
+        """The coder's own."""
         return self.coder.limits
 
     @property
     def version(self) -> str:
-        """The coder's, and the groups."""
+        """The coder's own, and the digest of the groups."""
         digest = hashlib.sha256()
         for groups in self.groups:
             digest.update(groups.tobytes())
@@ -180,7 +173,7 @@ def _note(group: str) -> str:
 
 
 def _group_sse(decoded: I420, frame: I420, groups: NDArray[np.uint8]) -> F64:
-    """The sum of squared luma errors over the pixels of each group."""
+    """Return the sum of squared luma errors over the pixels of each group."""
     difference = decoded.y.astype(np.float64) - frame.y
     squares = (difference * difference).ravel()
     sums = np.bincount(groups.ravel(), weights=squares, minlength=len(GROUPS))
@@ -198,11 +191,11 @@ class ClassQuality:
     """One of ``GROUPS``, or ``all``; ``class`` in the file."""
     psnr_db: float
     share_percent: float
-    """Of the pixels of all frames but the first."""
+    """Share of the pixels of all frames but the first."""
     equal: str
     """What is the same for all coders: ``bits``, or ``quality`` of the whole picture."""
     at_db: float
-    """That quality; for equal bits, the one that ours has for them."""
+    """That quality; for equal bits, the one that our coder has for them."""
     bytes_per_frame: float
 
     def row(self) -> dict[str, Any]:
@@ -298,28 +291,6 @@ def _shares(pixels: F64) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class ClassesJob:
-    """What to run; see ``rfedge-lab classes --help``."""
-
-    field: Path
-    drives: Sequence[str]
-    at_db: Sequence[float]
-    effort: str
-    preset: str
-    out: Path
-    cells: Path
-    quick: bool = False
-
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-        check_effort("effort", self.effort)
-        if not self.drives:
-            raise InvalidInput("drives", "there is none")
-        if not self.at_db or not all(0 < db < 100 for db in self.at_db):
-            raise InvalidInput("at_db", f"{tuple(self.at_db)} are not decibels within 0..100")
-
-
-@dataclass(frozen=True)
 class ClassComparison:
     """One drive with ours and the rivals; the first coder is ours."""
 
@@ -354,41 +325,34 @@ class ClassComparison:
         found = sorted(clips, key=lambda coded: coded.point)
         step = found[-1].point - found[-2].point
         while found[-1].bytes_per_frame() > wanted[0] and found[-1].point < worst:
-            found.append(self._coded(coder, store, min(found[-1].point + step, worst)))
+            point = min(found[-1].point + step, worst)
+            found.append(coded_clip(self.clip, coder, point, store))
         while found[0].bytes_per_frame() < wanted[1] and found[0].point > best:
-            found.insert(0, self._coded(coder, store, max(found[0].point - step, best)))
+            point = max(found[0].point - step, best)
+            found.insert(0, coded_clip(self.clip, coder, point, store))
         return found
 
-    def _coded(self, coder: ClassCoder, store: CellStore, point: float) -> CodedClip:
-        clip = self.clip
-        key = clip_key(clip, coder, point)
-        return store.clip(key, lambda: coder.code(clip.frames, clip.rate_hz, point))
 
-
-def run_classes(job: ClassesJob, console: Console) -> dict[str, Any]:
-    """Code what is not there yet, write ``job.out`` and print the rows.
+def run_classes(job: EvalClasses, console: Console) -> dict[str, Any]:
+    """Code what is not there yet, write the result and print its rows.
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong, and
     ``InvalidInput`` afterwards for qualities or bits that a coder does not reach.
     """
     drives = [DriveOfField.parse(text, job.field) for text in job.drives]
-    made, store = provenance(list(dict.fromkeys(d.field for d in drives))), CellStore(job.cells)
+    run = Run.begin("classes", job, dict.fromkeys(d.field for d in drives), console)
     comparisons = [_comparison(job, drive) for drive in drives]
-    left_s = sum(seconds_left(c.clip, c.coders.values(), store) for c in comparisons)
-    console.print(f"{len(comparisons)} drives, about {left_s / 60:.1f} minutes left to do")
+    left_s = sum(seconds_left(c.clip, c.coders.values(), run.store) for c in comparisons)
+    run.tell(f"{len(comparisons)} drives, about {left_s / 60:.1f} minutes left to do")
     found: list[ClassQuality] = []
     for comparison in comparisons:
-        curves = comparison.curves(store, job.at_db)
+        curves = comparison.curves(run.store, job.at_db)
         found += chain.from_iterable(quality_at(curves, comparison.clip, db) for db in job.at_db)
     frames = {f"{c.clip.scene}@{c.clip.rate_hz:g}": c.clip.frames_digest for c in comparisons}
-    content = {"quick": job.quick, "frames": frames, "rows": [each.row() for each in found]}
-    result = make_result("classes", made, content)
-    write_result(job.out, result)
-    print_table(console, "Luma PSNR by class", COLUMNS, _lines(found))
-    return result
+    return run.finish({"frames": frames, "rows": [each.row() for each in found]}, _parts)
 
 
-def _comparison(job: ClassesJob, given: DriveOfField) -> ClassComparison:
+def _comparison(job: EvalClasses, given: DriveOfField) -> ClassComparison:
     drive, field = given.read(QUICK_FRAMES if job.quick else None)
     groups = read_groups(given.name, drive)
     ours = FieldCoder(
@@ -405,23 +369,52 @@ def _comparison(job: ClassesJob, given: DriveOfField) -> ClassComparison:
 
 
 SHOWN = (ALL, *GROUPS[1:], GROUPS[0])
-COLUMNS = ("scene", "Hz", "equal", "at dB", "method", "bytes", *SHOWN)
-PIXELS = "share of the pixels, %"
 
 
-def classes_section(path: Path, result: Result) -> str:
-    """Return the table of a result: a line for each coder at equal bits or equal quality."""
-    rows = ClassQuality.of_rows(result["rows"])
-    return "\n\n".join([heading(path, result), table(COLUMNS, _lines(rows)), ""])
+def _parts(result: Result) -> Iterator[Table | str]:
+    """Yield a table for each drive and quality, and for each drive the classes' shares."""
+    tables: dict[str, dict[tuple[str, str], list[ClassQuality]]] = {}
+    shares: dict[str, list[ClassQuality]] = {}
+    for row in ClassQuality.of_rows(result["rows"]):
+        drive = f"{row.scene}, {row.hz:g} Hz"
+        lines = tables.setdefault(f"{drive}: PSNR of the luma, dB, at equal {row.equal}", {})
+        lines.setdefault((row.method, f"{row.at_db:g} dB"), []).append(row)
+        shares.setdefault(drive, []).append(row)
+    for title, lines in tables.items():
+        several = len({at_db for _, at_db in lines}) > 1
+        cells = [
+            [f"{method} at {at_db}" if several else method, *_line(rows)]
+            for (method, at_db), rows in lines.items()
+        ]
+        yield text_table(("method", "bytes a frame", *SHOWN), cells, title)
+    by_drive = [
+        [drive, *_by_class(rows, lambda row: f"{row.share_percent:.1f}")]
+        for drive, rows in shares.items()
+    ]
+    yield text_table(("drive", *SHOWN), by_drive, "Share of the pixels, %")
 
 
-def _lines(rows: Sequence[ClassQuality]) -> list[list[str]]:
-    """PSNR in dB, after a line for each drive with the classes' shares of its pixels."""
-    lines: dict[tuple[str, ...], dict[str, str]] = {}
-    for row in rows:
-        drive = row.scene, f"{row.hz:g}"
-        shares = lines.setdefault((*drive, "-", "-", PIXELS, "-"), {})
-        shares[row.class_] = f"{row.share_percent:.1f}"
-        point = row.equal, f"{row.at_db:g}", row.method, f"{row.bytes_per_frame:.0f}"
-        lines.setdefault((*drive, *point), {})[row.class_] = f"{row.psnr_db:.2f}"
-    return [[*key, *(cells.get(name, "-") for name in SHOWN)] for key, cells in lines.items()]
+def _line(rows: Sequence[ClassQuality]) -> list[str]:
+    quality = _by_class(rows, lambda row: f"{row.psnr_db:.2f}")
+    return [f"{rows[0].bytes_per_frame:.0f}", *quality]
+
+
+def _by_class(rows: Sequence[ClassQuality], text: Callable[[ClassQuality], str]) -> list[str]:
+    found = {row.class_: text(row) for row in rows}
+    return [found.get(name, "-") for name in SHOWN]
+
+
+def _bars(result: Result) -> Iterator[tuple[str, float]]:
+    for row in ClassQuality.of_rows(result["rows"]):
+        if row.equal == EQUAL_BITS:
+            yield f"{row.scene} {row.class_}: {row.method}", row.psnr_db
+
+
+REPORT = Report(
+    "classes",
+    "Quality by class",
+    "How well vehicles, people, signs and markings are seen at the same bits, and at the same "
+    "quality of the whole picture, by our coder and by x264.",
+    _parts,
+    bars("luma PSNR at equal bits, dB", _bars),
+)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional
 
-from rfcore.codec.h264.config import DEFAULT_EFFORT
+from rfcore.codec.h264.config import DEFAULT_EFFORT, check_effort
+from rfcore.errors import InvalidInput
+from rfedge.evaluate import Experiment
 from rfedge.samples import sample_path
 
 __all__ = ["EvalLatency"]
@@ -19,8 +21,8 @@ SAMPLES = (
 )
 
 
-@dataclass(frozen=True)
-class EvalLatency:
+@dataclass(frozen=True, kw_only=True)
+class EvalLatency(Experiment):
     """Play our frames and low-delay x264's, of equal quality, over links on a virtual clock.
 
     Tau and network latency over throughput and over recorded traces, the share of frames within 5
@@ -34,46 +36,31 @@ class EvalLatency:
     traces: tuple[Path, ...] = (sample_path("links/drive.up"),)
     """Recorded uplinks in Mahimahi's format."""
     effort: str = DEFAULT_EFFORT
-    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
+    """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: str = "veryfast"
     """x264 preset of the other."""
     quality_db: float = 33.0
     """Luma PSNR that both are coded to."""
     out: Path = Path("out/eval/latency.json")
-    """The result file to write."""
     figures: Path = Path("out/eval/figures")
     """Folder of the figures (SVG, and CSV with their numbers)."""
     cells: Path = Path("out/eval/latency")
-    """Folder of finished pieces."""
-    quick: bool = False
-    """Six frames of each drive: to see that it works, not for figures."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_effort("effort", self.effort)
+        if not 20 <= self.quality_db <= 50:
+            raise InvalidInput("quality_db", f"{self.quality_db} dB is outside 20..50 dB")
 
     def run(self) -> None:
         """Code what is not there yet, play it, write rows and figures, print what is needed."""
         from rich.console import Console
 
-        from lab.latency.report import (
-            NeededRow,
-            print_needed,
-            write_latency_figures,
-        )
-        from lab.latency.run import LatencyJob, run_latency
+        from lab.latency.report import write_latency_figures
+        from lab.latency.run import run_latency
         from rfedge.arguments import field_path
-        from rfedge.results import rows_of
 
-        job = LatencyJob(
-            field=field_path(self.field),
-            drives=self.drives,
-            traces=self.traces,
-            effort=self.effort,
-            preset=self.preset,
-            quality_db=self.quality_db,
-            out=self.out,
-            cells=self.cells,
-            quick=self.quick,
-        )
         console = Console()
-        result = run_latency(job, console)
-        print_needed(console, rows_of(NeededRow, result["needed"]))
-        for path in write_latency_figures(result, self.figures):
+        result = run_latency(replace(self, field=field_path(self.field)), console)
+        for path in write_latency_figures(result, self.figures, "latency"):
             console.print(f"  {path}")

@@ -1,4 +1,4 @@
-"""The latency experiment's rows, as figures and as a section of the results page.
+"""The latency experiment's rows, as tables and as figures.
 
 ``scene``, ``hz`` and ``method`` name a sender in every kind of row; ``crf`` and ``psnr_db`` are the
 operating point that its clip was coded at. Latencies are in milliseconds a frame.
@@ -6,23 +6,22 @@ operating point that its clip was coded at. Latencies are in milliseconds a fram
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
+from lab.report import Report
 from rfcore.errors import InvalidInput
-from rfedge.report.tables import heading, pivot, print_table, table
+from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
 __all__ = [
+    "REPORT",
     "NeededRow",
     "PlayedRow",
     "ShownRow",
-    "latency_section",
-    "print_needed",
+    "latency_parts",
     "write_latency_figures",
 ]
 
@@ -35,20 +34,15 @@ class NeededRow:
     hz: float
     method: str
     crf: float
-    psnr_db: float
-    kbit_per_frame: float
+    psnr_db: float = field(metadata=shown("dB", ".2f"))
+    kbit_per_frame: float = field(metadata=shown("kbit a frame", ".1f"))
     """Mean over all frames but the first."""
-    largest_kbit: float
-    first_frame_kbit: float
+    largest_kbit: float = field(metadata=shown("largest", ".1f"))
+    first_frame_kbit: float = field(metadata=shown("first", ".1f"))
     uplink_bps_p99_within: Mapping[str, float]
     """Lowest constant rate at which 99 % of the frames are in time, by the budget in ms."""
     stage_ms: Mapping[str, float]
     """Processor time of each stage at one thread, lower quartiles."""
-
-    @property
-    def sender(self) -> str:
-        """Drive and method in a few words."""
-        return _sender(self)
 
 
 @dataclass(frozen=True)
@@ -60,7 +54,7 @@ class PlayedRow:
     method: str
     crf: float
     psnr_db: float
-    link: str
+    link: str = field(metadata=shown("link"))
     rate_bps: float
     frames: int
     dropped: int
@@ -69,17 +63,12 @@ class PlayedRow:
     """Transmission time: mean, p50 and p99."""
     network_ms: Mapping[str, float]
     """From sending to arrival: waiting, transmission and delay."""
-    network_p99_ms: float | None
-    """Of all frames, dropped ones among them."""
+    network_p99_ms: float | None = field(metadata=shown("p99 ms", ".2f", "never"))
+    """Quantile over all frames, dropped ones among them."""
     share_within: Mapping[str, float]
     """Share of the frames that came in time, by the budget in ms."""
     network_quantiles_ms: Sequence[float | None]
     """At equal steps of the share, from 0 to 1."""
-
-    @property
-    def sender(self) -> str:
-        """Drive and method in a few words."""
-        return _sender(self)
 
 
 @dataclass(frozen=True)
@@ -94,83 +83,71 @@ class ShownRow:
     psnr_db: float
     width_px: int
     height_px: int
-    link: str
+    link: str = field(metadata=shown("link"))
     rate_bps: float
     frames: int
     dropped: int
     """Frames that a newer one overtook before they were coded."""
     sent_ms: Mapping[str, float]
-    """Of the frames that were sent: mean, p50 and p99."""
+    """Latency of the frames that were sent: mean, p50 and p99."""
     shown_p50_ms: float | None
-    """Of all frames, dropped ones among them."""
+    """Quantiles over all frames, dropped ones among them."""
     shown_p99_ms: float | None
     share_within: Mapping[str, float]
     """Share of all frames that were shown in time, by the budget in ms."""
     sender_busy_percent: float
-    """Of the time, one core of the vehicle."""
+    """Share of the time that one core of the vehicle computes."""
     receiver_busy_percent: float
 
 
-def _sender(row: NeededRow | PlayedRow | ShownRow) -> str:
+def sender_of(row: NeededRow | PlayedRow | ShownRow) -> str:
+    """Return drive and method in a few words."""
     return f"{row.scene} {row.hz:g} Hz, {row.method.split('-')[0]}"
 
 
 CDF_RATE_BPS = 4e6
 """The rate whose distribution is drawn: the demo's link."""
 
-NEEDED = (
-    "scene",
-    "Hz",
-    "method",
-    "dB",
-    "kbit a frame",
-    "largest",
-    "first",
-    "uplink for p99 within 5 ms, Mbit/s",
-    "within 10 ms",
+SENDER = Column("sender", sender_of)
+WITHIN_5 = Column(
+    "uplink for 99 % within 5 ms, Mbit/s", lambda row: row.uplink_bps_p99_within["5"] / 1e6, ".2f"
 )
+WITHIN_10 = Column("within 10 ms", lambda row: row.uplink_bps_p99_within["10"] / 1e6, ".2f")
+NETWORK_P50 = Column("sending to arrival, p50 ms", lambda row: row.network_ms["p50"], ".2f")
+DROPPED = Column("dropped %", lambda row: 100 * row.dropped / row.frames, ".0f")
+SHOWN_P50 = Column("to shown, p50 ms", lambda row: row.sent_ms["p50"], ".0f")
+SHOWN_P99 = Column("p99 ms", lambda row: row.sent_ms["p99"], ".0f")
+IN_TIME = Column("shown within 100 ms, %", lambda row: 100 * row.share_within["100"], ".0f")
 
 
-def latency_section(path: Path, result: Result) -> str:
-    """Return the tables: what uplink is needed, and what each link makes of the frames."""
+def latency_parts(result: Result) -> Iterator[Table | str]:
+    """Yield what uplink is needed, and what each link makes of the frames."""
     requirement = result["requirement"]
-    notes = (
+    yield (
         f"Both methods at the same luma PSNR; the first frame, which a stream sends once, apart. "
         f"{result['played_frames']} frames are played over each link (the clip again and again), "
         f"with at most two under way; a frame dropped before coding counts as late. They cannot "
         f"show {100 * requirement['share']:g} %: to claim that with 95 % confidence, "
         f"{requirement['frames_needed']:,} different frames in a row would have to be in time."
     )
-    carried = (
-        "From sending to arrival in ms: half of the frames that were sent, 99 % of all frames "
-        f"(how many were dropped); {path.name} has more quantiles."
+    needed = rows_of(NeededRow, result["needed"])
+    sizes = ("psnr_db", "kbit_per_frame", "largest_kbit", "first_frame_kbit", WITHIN_5, WITHIN_10)
+    yield Table("What each sender needs", columns(NeededRow, SENDER, *sizes), needed)
+    carried = columns(PlayedRow, "link", SENDER, NETWORK_P50, "network_p99_ms", DROPPED)
+    played = rows_of(PlayedRow, result["rows"])
+    yield Table(
+        "The link alone: half of the frames that were sent, 99 % of all frames", carried, played
     )
-    computed = (
+    yield (
         "From capture to shown: either end computes with one thread, one frame at a time, as long "
         "as that frame took when it was measured, and frames wait for it; a vehicle codes the "
-        "newest picture, and older ones are dropped. In ms half and 99 % of the frames that were "
-        "sent, and how many of all were shown within 100 ms."
+        "newest picture, and older ones are dropped."
     )
-    needed = [_needed_cells(row) for row in rows_of(NeededRow, result["needed"])]
-    played = rows_of(PlayedRow, result["rows"])
-    shown = rows_of(ShownRow, result["shown"])
-    tables = (
-        carried,
-        pivot("sender", ((_sender(row), row.link, _played_cell(row)) for row in played)),
-        computed,
-        pivot("sender", ((_sender(row), row.link, _shown_cell(row)) for row in shown)),
-    )
-    return "\n\n".join([heading(path, result), notes, table(NEEDED, needed), *tables, ""])
+    seen = columns(ShownRow, "link", SENDER, SHOWN_P50, SHOWN_P99, DROPPED, IN_TIME)
+    yield Table("From capture to shown", seen, rows_of(ShownRow, result["shown"]))
 
 
-def print_needed(console: Console, rows: Sequence[NeededRow]) -> None:
-    """Print what uplink each sender needs."""
-    columns = (*NEEDED[:4], "kbit", "p99 <= 5 ms, Mbit/s", "p99 <= 10 ms, Mbit/s")
-    cells = [[*_needed_cells(row)[:5], *_needed_cells(row)[-2:]] for row in rows]
-    print_table(console, "Uplink that 99 % of the frames need", columns, cells)
-
-
-def write_latency_figures(result: Result, folder: Path) -> list[Path]:
+def write_latency_figures(result: Result, folder: Path, _name: str) -> list[Path]:
     """Write ``tau_vs_throughput``, ``latency_cdf`` and ``stage_stack`` (SVG and CSV).
 
     Raises ``InvalidInput`` for a result without rows.
@@ -186,38 +163,10 @@ def write_latency_figures(result: Result, folder: Path) -> list[Path]:
     ]
 
 
-def _needed_cells(row: NeededRow) -> list[str]:
-    uplink = row.uplink_bps_p99_within
-    return [
-        row.scene,
-        f"{row.hz:g}",
-        row.method,
-        f"{row.psnr_db:.2f}",
-        f"{row.kbit_per_frame:.1f}",
-        f"{row.largest_kbit:.1f}",
-        f"{row.first_frame_kbit:.1f}",
-        *(f"{uplink[budget] / 1e6:.2f}" for budget in ("5", "10")),
-    ]
-
-
-def _played_cell(row: PlayedRow) -> str:
-    dropped = f" ({100 * row.dropped / row.frames:.0f} %)" if row.dropped else ""
-    return f"{row.network_ms['p50']:.2f} / {_ms(row.network_p99_ms)}{dropped}"
-
-
-def _shown_cell(row: ShownRow) -> str:
-    in_time = 100 * row.share_within["100"]
-    return f"{row.sent_ms['p50']:.0f} / {row.sent_ms['p99']:.0f}, {in_time:.0f} %"
-
-
-def _ms(value: float | None) -> str:
-    return "never" if value is None else f"{value:.2f}"
-
-
 def _by_sender(rows: Sequence[PlayedRow]) -> dict[str, list[PlayedRow]]:
     senders: dict[str, list[PlayedRow]] = {}
     for row in rows:
-        senders.setdefault(row.sender, []).append(row)
+        senders.setdefault(sender_of(row), []).append(row)
     return senders
 
 
@@ -255,8 +204,8 @@ def _cdf_figure(played: Sequence[PlayedRow], stem: Path) -> list[Path]:
             quantiles = row.network_quantiles_ms
             arrived = [(ms, k / (len(quantiles) - 1)) for k, ms in enumerate(quantiles) if ms]
             x, y = zip(*arrived, strict=True)
-            axes.step(x, y, where="post", color=LINES[number % 6], label=row.sender)
-            lines += [[row.sender, f"{b:.2f}", f"{a:.3f}"] for a, b in arrived]
+            axes.step(x, y, where="post", color=LINES[number % 6], label=sender_of(row))
+            lines += [[sender_of(row), f"{b:.2f}", f"{a:.3f}"] for a, b in arrived]
         axes.axvspan(5, 10, color="#dfe4ea", zorder=0, label="budgets: 5 to 10 ms")
         axes.set(xlabel=f"network latency at {CDF_RATE_BPS / 1e6:g} Mbit/s, ms", ylabel="share")
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
@@ -270,8 +219,10 @@ def _stack_figure(
 
     from rfedge.report.charts import LINES, STYLE, write_figure
 
-    network = {r.sender: r.network_ms["p50"] for r in played if r.rate_bps == CDF_RATE_BPS}
-    stacks = {row.sender: {**row.stage_ms, "network": network[row.sender]} for row in needed}
+    network = {sender_of(r): r.network_ms["p50"] for r in played if r.rate_bps == CDF_RATE_BPS}
+    stacks = {
+        sender_of(row): {**row.stage_ms, "network": network[sender_of(row)]} for row in needed
+    }
     stages = list(dict.fromkeys(stage for stack in stacks.values() for stage in stack))
     lines = [["sender", *stages]]
     with plt.rc_context({**STYLE, "axes.grid.axis": "x"}):
@@ -289,3 +240,13 @@ def _stack_figure(
     for name, stack in stacks.items():
         lines.append([name, *(f"{stack.get(stage, 0.0):.2f}" for stage in stages)])
     return write_figure(stem, figure, lines)
+
+
+REPORT = Report(
+    "latency",
+    "Latency over links",
+    "How long our frames and those of x264 take over constant and recorded links at equal quality, "
+    "and which uplink they need.",
+    latency_parts,
+    write_latency_figures,
+)

@@ -1,4 +1,4 @@
-"""How long frames take over links, on a virtual clock: drives and a field in, one result out.
+"""Measure how long frames take over links, on a virtual clock.
 
 Ours and low-delay x264 are coded to the same quality (the CRF is searched in steps of a half), then
 sent over constant rates and over recorded links. A clip is sent again and again without its first
@@ -29,26 +29,25 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from lab.latency.report import NeededRow, PlayedRow, ShownRow
-from rfcore.codec.h264.config import check_effort
+from lab.latency import EvalLatency
+from lab.latency.report import NeededRow, PlayedRow, ShownRow, latency_parts
 from rfcore.codec.sender.ladder import Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.link import DirectionPlan, LinkProfile
 from rfcore.link.traces import read_mahimahi
-from rfedge.evaluate.cells import CellStore, clip_key, program_version
 from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.ladder.measure import measure_frames, time_renders
 from rfedge.evaluate.rivals import x264_lowdelay
-from rfedge.results import check_result_path, make_result, provenance, write_result
+from rfedge.evaluate.runner import Run, coded_clip, program_version
+from rfedge.jobs import CellStore
 
 __all__ = [
     "BUDGETS_MS",
     "FRAMES_FOR_REQUIREMENT",
     "REQUIREMENT",
     "FrameWork",
-    "LatencyJob",
     "Played",
     "at_quality",
     "needed_rate_bps",
@@ -62,7 +61,7 @@ __all__ = [
 WINDOW = 2
 """Frames of one camera under way (``mec_server.config.SessionLimits``)."""
 CAPTURED = 1e-9
-"""Of a frame's period: the frame of a moment is there at that moment, whatever rounding says."""
+"""Share of a frame's period by which rounding may miss the moment of its capture."""
 BUDGETS_MS = (5.0, 10.0)
 """Network latencies a digital twin asks for (the paper: 5 to 10 ms)."""
 REQUIREMENT = 0.99999
@@ -227,30 +226,9 @@ EndsMs = list[tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class LatencyJob:
-    """What to play; see ``rfedge-lab latency --help``."""
-
-    field: Path
-    drives: Sequence[str]
-    traces: Sequence[Path]
-    effort: str
-    preset: str
-    quality_db: float
-    out: Path
-    cells: Path
-    quick: bool = False
-
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-        check_effort("effort", self.effort)
-        if not 20 <= self.quality_db <= 50:
-            raise InvalidInput("quality_db", f"{self.quality_db} dB is outside 20..50 dB")
-
-
-@dataclass(frozen=True)
 class Sender:
-    """A method at one quality: its frames, what both ends compute, stage by stage, and what each
-    frame takes of them."""
+    """A method at one quality: its frames, what both ends compute for them stage by stage, and what
+    each frame takes."""
 
     clip: Clip
     method: str
@@ -260,7 +238,7 @@ class Sender:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What every row says about the sender."""
+        """The values that every row has of the sender."""
         return {
             "scene": self.clip.scene,
             "hz": self.clip.rate_hz,
@@ -270,21 +248,21 @@ class Sender:
         }
 
 
-def run_latency(job: LatencyJob, console: Console) -> dict[str, Any]:
-    """Code, play, write ``job.out``, and return its content."""
+def run_latency(job: EvalLatency, console: Console) -> dict[str, Any]:
+    """Code what is not there yet, play it, write the result and print its rows."""
     names = [DriveName.parse(text) for text in job.drives]
     links = list(_links(job.traces))
-    field, made = load_field(job.field), provenance([job.field, *job.traces])
-    console.print(
+    run = Run.begin("latency", job, [job.field, *job.traces], console)
+    field = load_field(job.field)
+    run.tell(
         f"{2 * len(names)} clips to code at about 5 CRFs each, {len(links)} links to play them over"
     )
     began_s = monotonic()
-    senders = [s for name in names for s in _senders(job, name, field, console)]
-    console.print(f"coded in {monotonic() - began_s:.0f} s")
+    senders = [s for name in names for s in _senders(job, name, field, run)]
+    run.tell(f"coded in {monotonic() - began_s:.0f} s")
     rows = [_row(sender, name, plan) for sender in senders for name, plan in links]
     shown = [_shown(sender, name, plan) for sender in senders for name, plan in links]
     content = {
-        "quick": job.quick,
         "field_id": field.field_id,
         "field_psnr_db": {s.clip.scene: s.clip.field_psnr_db for s in senders},
         "frames": {s.clip.scene: s.clip.frames_digest for s in senders},
@@ -295,9 +273,7 @@ def run_latency(job: LatencyJob, console: Console) -> dict[str, Any]:
         "rows": rows,
         "shown": shown,
     }
-    result = make_result("latency", made, content)
-    write_result(job.out, result)
-    return result
+    return run.finish(content, latency_parts)
 
 
 def _links(traces: Sequence[Path]) -> Iterator[tuple[str, DirectionPlan]]:
@@ -308,27 +284,24 @@ def _links(traces: Sequence[Path]) -> Iterator[tuple[str, DirectionPlan]]:
         yield path.stem, DirectionPlan(LinkProfile(trace.mean_rate_bps), (trace,))
 
 
-def _senders(
-    job: LatencyJob, name: DriveName, field: RadianceField, console: Console
-) -> Iterator[Sender]:
+def _senders(job: EvalLatency, name: DriveName, field: RadianceField, run: Run) -> Iterator[Sender]:
     drive = read_drive(name, QUICK_FRAMES if job.quick else None)
     rendered, clip = render_clip(field, drive.cameras), drive.clip()
-    store = CellStore(job.cells)
     ours = FieldCoder(rendered, f"rfedge-{job.effort}", program_version(), effort=job.effort)
-    coded = at_quality(clip, ours, job.quality_db, store)
+    coded = at_quality(clip, ours, job.quality_db, run.store)
     stages, ends_ms = _own_times(job, drive, field, coded.point)
     yield Sender(clip, ours.name, coded, stages, _work(coded, ends_ms))
     rival = x264_lowdelay(job.preset)
-    coded = at_quality(clip, rival, job.quality_db, store)
+    coded = at_quality(clip, rival, job.quality_db, run.store)
     ends_ms = _least(rival.frames_ms(clip.frames, clip.rate_hz, coded.point) for _ in range(TIMED))
     encode_ms, decode_ms = np.quantile(ends_ms[1:], 0.25, axis=0).tolist()
     stages = {"sender encode": encode_ms, "receiver decode": decode_ms}
     yield Sender(clip, rival.name, coded, stages, _work(coded, ends_ms))
-    console.print(f"  {name.scene} {name.rate_hz:g} Hz")
+    run.tell(f"  {name.scene} {name.rate_hz:g} Hz")
 
 
 def _own_times(
-    job: LatencyJob, drive: Drive, field: RadianceField, crf: float
+    job: EvalLatency, drive: Drive, field: RadianceField, crf: float
 ) -> tuple[dict[str, float], EndsMs]:
     """Return the milliseconds of both ends, stage by stage, from the ladder's measurement of the
     full rung, and those of each frame."""
@@ -356,18 +329,13 @@ def _work(coded: CodedClip, ends_ms: EndsMs) -> list[FrameWork]:
 
 def at_quality(clip: Clip, coder: ClipCoder, quality_db: float, store: CellStore) -> CodedClip:
     """Return the clip at the highest CRF, in steps of a half, that is not below ``quality_db``."""
-
-    def coded(crf: float) -> CodedClip:
-        key = clip_key(clip, coder, crf)
-        return store.clip(key, lambda: coder.code(clip.frames, clip.rate_hz, crf))
-
     low, high = LOWEST_CRF, HIGHEST_CRF
     crf = FIRST_CRF
     while high - low > CRF_STEP:
-        good = coded(crf).psnr_db() >= quality_db
+        good = coded_clip(clip, coder, crf, store).psnr_db() >= quality_db
         low, high = (crf, high) if good else (low, crf)
         crf = low + CRF_STEP * max(1, round((high - low) / 2 / CRF_STEP))
-    return coded(low)
+    return coded_clip(clip, coder, low, store)
 
 
 def _row(sender: Sender, name: str, plan: DirectionPlan) -> PlayedRow:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from lab.live.report import AgeRow, IngestRow, SourceRow, print_live
+from lab.live.report import AgeRow, IngestRow, SourceRow, live_parts
 from lab.live.showing import TwinBed, agent, measure_age, measure_ingest, watching
 from lab.soak import slope_per_minute
 from rfcore.dataset import read_dataset
@@ -28,6 +28,7 @@ from rfcore.errors import BackendUnavailable, InvalidInput, RfedgeError
 from rfcore.image import jpeg_bytes
 from rfedge.loadtest.usage import Usage, Watcher
 from rfedge.processes import command_of, service
+from rfedge.report.tables import Table
 from rfedge.results import CHECKOUT, check_result_path, make_result, provenance, write_result
 
 __all__ = ["LiveCamera", "LiveJob", "measure_source", "run_live"]
@@ -283,14 +284,20 @@ def run_live(job: LiveJob, console: Console) -> None:
     ages: list[AgeRow] = []
     for count in job.cameras:
         ages.append(measure_age(bed, count))
-        print_live(console, ages[-1:])
+        _print(console, "ages", ages[-1])
     ingest: list[IngestRow] = []
     if job.rounds:
         ingest.append(measure_ingest(bed, job.rounds, job.consumers))
-        print_live(console, ingest)
+        _print(console, "ingest", ingest[0])
     sources: list[SourceRow] = []
     for kind in job.sources:
         sources.append(measure_source(job.camera(kind), job.drive, job.field, job.work))
-        print_live(console, sources[-1:])
+        _print(console, "sources", sources[-1])
     content = {"settings": asdict(job), "ages": ages, "ingest": ingest, "sources": sources}
     write_result(job.out, make_result("live", provenance([job.field, job.drive]), content))
+
+
+def _print(console: Console, part: str, row: AgeRow | IngestRow | SourceRow) -> None:
+    for table in live_parts({part: [asdict(row)]}):
+        if isinstance(table, Table):
+            table.print(console)

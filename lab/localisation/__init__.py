@@ -1,9 +1,9 @@
 """``rfedge-lab localise``: poses found again from wrong ones, tracking, and what errors cost.
 
-Two kinds of rows: *starts* (``lab.localisation.measure``), searches from start errors
-and from false starts, with the tracker's time beside; *bits*
-(``lab.localisation.bits``). Each row is a cell (``rfedge.evaluate.cells``), kept
-as it ends: the same command goes on where it was stopped. Cells share so many processes.
+There are two kinds of rows: *starts* (``lab.localisation.measure``) are searches from start
+errors and from false starts, with the tracker's time beside; *bits* (``lab.localisation.bits``) say
+what errors of measured poses cost. Each row is kept as it ends, so the same command goes on where
+it was stopped.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import JSON
+from rfedge.evaluate import Experiment
 
 __all__ = ["EvalLocalise"]
 
@@ -23,8 +23,8 @@ ERRORS = ("white-small", "white-large", "offset", "gnss", "exact,silent_from_s=0
 CRFS = (20.0, 25.0, 30.0, 35.0)
 
 
-@dataclass(frozen=True)
-class EvalLocalise:
+@dataclass(frozen=True, kw_only=True)
+class EvalLocalise(Experiment):
     """Measure searches, tracking, and the bits that errors of measured poses cost."""
 
     drives: Annotated[tuple[str, ...], Positional, arg(metavar="NAME=DRIVE,FIELD[,KEY=VALUE...]")]
@@ -50,37 +50,26 @@ class EvalLocalise:
     """Threads of the renderer; times are those of one core with 1."""
     processes: int = 1
     """Jobs at a time; no more than cores, or times mean nothing."""
-    quick: bool = False
-    """Six tries and false starts from one start error, two sensors on eight frames."""
     cells: Path = Path("out/eval/localise")
-    """Finished rows; the same command goes on from there, another program measures anew."""
-    out: Annotated[Path, JSON] = Path("out/eval/localise.json")
-    """The result file to write."""
+    out: Path = Path("out/eval/localise.json")
+
+    def __post_init__(self) -> None:
+        from rfedge.jobs import check_processes
+
+        super().__post_init__()
+        check_processes(self.processes)
 
     def run(self) -> None:
-        """Measure every drive and print each row as it is there.
+        """Measure every row that is not there yet, write the rows and print them."""
+        from rich.console import Console
 
-        Raises ``InvalidInput`` for drives, starts and sensors of another form and for a number of
-        processes that cannot be, before any work.
-        """
-        from lab.localisation.given import GivenDrive
-        from lab.localisation.measure import pieces, rows_of_pieces
-        from rfedge.evaluate.cells import check_processes
-        from rfedge.results import check_result_path, make_result, provenance, write_result
+        from lab.localisation.measure import run_localise
 
-        check_result_path(self.out)
-        check_processes(self.processes)
-        asked = _quick(self) if self.quick else self
-        given = [GivenDrive.parse(text) for text in asked.drives]
-        made = provenance(path for drive in given for path in (drive.field, drive.drive))
-        rows = []
-        for row in rows_of_pieces(pieces(asked, given), asked.cells, asked.processes):
-            rows.append(row)
-            print(row, flush=True)
-        write_result(self.out, make_result("localise", made, {"rows": rows}))
+        run_localise(_quick(self) if self.quick else self, Console())
 
 
 def _quick(asked: EvalLocalise) -> EvalLocalise:
+    """Return six tries and false starts from one start error, two sensors on eight frames."""
     return replace(
         asked,
         tries=6,

@@ -1,16 +1,10 @@
-"""The rows of a result of kind ``localise``, and its section of the results page."""
+"""The rows of a result of kind ``localise``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
-from rfedge.report.tables import cell, heading, table
-from rfedge.results import Result, rows_of
-
-__all__ = ["BitsRow", "LocaliseRow", "localise_section"]
+__all__ = ["BitsRow", "LocaliseRow"]
 
 
 @dataclass(frozen=True)
@@ -33,9 +27,9 @@ class LocaliseRow:
     localise_cpu_ms: float | None
     """The same in processor time, which other work on the machine changes less."""
     track_cpu_ms: float | None = None
-    """Median processor time of tracking a picture with all its renders, where it was measured,"""
+    """Median processor time of tracking a picture with all its renders, if it was measured."""
     render_cpu_ms: float | None = None
-    """and of a render alone in the same run."""
+    """Median processor time of a render alone in the same run."""
     false_cpu_ms: float | None = None
     """Median processor time of a false start."""
 
@@ -48,29 +42,11 @@ class BitsRow:
     pose_error: str
     bits_percent: float
     psnr_db: float
-    """Of the drive at found poses, mean over the qualities coded."""
+    """Luma PSNR of the drive at found poses, mean over the qualities coded."""
     tracked_percent: float
     localise_cpu_ms: float | None
     """Median processor time of a search."""
     track_cpu_ms: float
-    """Median of the tracker with all its renders, of the frames in which no search was run."""
+    """Median time of the tracker with all its renders, of the frames without a search."""
     render_cpu_ms: float
-    """Median of a render in the same run."""
-
-
-def localise_section(path: Path, result: Result) -> str:
-    """Return the table of searches from wrong poses, and that of what errors of sensors cost."""
-    bits = [row for row in result["rows"] if "pose_error" in row]
-    starts = [row for row in result["rows"] if "pose_error" not in row]
-    tables = (_table(LocaliseRow, starts), _table(BitsRow, bits))
-    return "\n\n".join([heading(path, result), *tables, ""])
-
-
-def _table(kind: type[Any], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return rows of ``kind`` under the names of its fields."""
-    cells = [[_rounded(value) for value in vars(row).values()] for row in rows_of(kind, rows)]
-    return table([field.name.replace("_", " ") for field in fields(kind)], cells)
-
-
-def _rounded(value: Any) -> str:
-    return cell(float(f"{value:.3g}")) if isinstance(value, float) else cell(value)
+    """Median time of a render in the same run."""

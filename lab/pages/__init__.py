@@ -1,1 +1,1 @@
-"""Pages of ``docs`` that are generated from result files and declarations, never typed."""
+"""Pages of recorded results, made of their files and never typed."""

@@ -1,4 +1,4 @@
-"""Recorded load tests: one file of the rows of many runs, and its section of the results page.
+"""Recorded load tests: one file of the rows of many runs, and the pages that show them.
 
 ``python -m lab.pages.loads RECORD.json RESULT.json...`` puts the rows of results that
 ``rfedge loadtest`` wrote into ``RECORD.json``, in place of those of the same loads. Each row keeps
@@ -8,18 +8,20 @@ the command and the revision that made it.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from lab.report import Report, bars, folded
 from rfcore.errors import RfedgeError
 from rfedge.loadtest.plan import Mode
 from rfedge.loadtest.run import LoadRow
-from rfedge.report.tables import cell, heading, table
+from rfedge.report.tables import Column, Table, text_table
 from rfedge.results import Result, make_result, provenance, read_result, rows_of, write_result
 
-__all__ = ["LimitRow", "RecordedLoad", "load_section", "ratio_section", "record"]
+__all__ = ["LOADS", "RATIO", "LimitRow", "RecordedLoad", "record"]
 
 KEY = (
     "mode",
@@ -37,25 +39,6 @@ KEY = (
     "run",
 )
 """Fields that tell one load from another: a recorded row is replaced by one that has the same."""
-COLUMNS = (
-    "mode",
-    "vehicles",
-    "cameras",
-    "hz",
-    "renderer",
-    "link",
-    "held",
-    "p50_ms",
-    "p99_ms",
-    "on_time_percent",
-    "on_time_at_least_percent",
-    "fairness",
-    "server_cores",
-    "server_loop_cores",
-    "vehicles_cores",
-    "others_cores",
-    "limited_by",
-)
 
 
 @dataclass(frozen=True)
@@ -88,12 +71,48 @@ def _order(row: LoadRow) -> tuple[int, str, float, int, int]:
     return list(Mode).index(Mode(row.mode)), row.kind, row.hz, row.vehicles, row.run or 0
 
 
-def load_section(path: Path, result: Result) -> str:
-    """Return a table of the runs, with what was not kept and the commands below it."""
+LOAD = (
+    Column("mode", lambda row: row.mode),
+    Column("vehicles", lambda row: row.vehicles),
+    Column("cameras", lambda row: row.cameras),
+    Column("Hz", lambda row: row.hz, "g"),
+    Column("link", lambda row: row.link or "loopback"),
+    Column("renderer", lambda row: row.renderer),
+    Column("run", lambda row: row.run),
+)
+LOAD_LATENCY = (
+    Column("held", lambda row: row.held),
+    Column("p50 ms", lambda row: row.p50_ms, ".1f"),
+    Column("p99 ms", lambda row: row.p99_ms, ".1f"),
+    Column("on time %", lambda row: row.on_time_percent, ".2f"),
+)
+LOAD_CORES = (
+    Column("fairness", lambda row: row.fairness, ".3f"),
+    Column("server cores", lambda row: row.server_cores, ".2f"),
+    Column("its loop", lambda row: row.server_loop_cores, ".2f"),
+    Column("vehicles' cores", lambda row: row.vehicles_cores, ".2f"),
+    Column("limited by", lambda row: row.limited_by),
+)
+
+
+def _load_parts(result: Result) -> Iterator[Table | str]:
     rows = rows_of(RecordedLoad, result["rows"])
-    cells = [[_shown(row, column) for column in COLUMNS] for row in rows]
-    notes = "\n".join(_note(row) for row in rows)
-    return "\n\n".join([heading(path, result), table(COLUMNS, cells), notes, ""])
+    yield Table("Latency", (*LOAD, *LOAD_LATENCY), rows)
+    yield Table("Processor time", (*LOAD, *LOAD_CORES), rows)
+    notes = "\n".join(f"* {_load_note(row)}" for row in rows)
+    yield folded("Commands, and what was not kept", notes)
+
+
+def _load_note(row: RecordedLoad) -> str:
+    broken = f" Not kept: {'; '.join(row.broken)}." if row.broken else ""
+    size = f"{row.width}x{row.height}, {row.payload_bytes:.0f} bytes of payload a frame"
+    return f"`{row.command}` at `{row.revision}` ({row.kind} vehicles, {size}).{broken}"
+
+
+def _load_bars(result: Result) -> Iterator[tuple[str, float]]:
+    for row in rows_of(RecordedLoad, result["rows"]):
+        if row.p99_ms is not None:
+            yield f"{row.mode}, {row.vehicles} x {row.hz:g} Hz, {row.renderer}", row.p99_ms
 
 
 @dataclass(frozen=True)
@@ -105,36 +124,36 @@ class LimitRow:
     server_ms_a_frame: float
 
 
-def ratio_section(path: Path, result: Result) -> str:
-    """Return what two revisions carry, measured in turn, and the ratios of the second to the
-    first."""
-    rows = rows_of(LimitRow, result["rows"])
-    before, now = rows
-    cells = [
+def _ratio_parts(result: Result) -> Iterator[Table | str]:
+    before, now = rows = rows_of(LimitRow, result["rows"])
+    held = median(now.vehicles) / max(1, median(before.vehicles))
+    spent = before.server_ms_a_frame / now.server_ms_a_frame
+    lines = [
         (row.code, ", ".join(map(str, row.vehicles)), f"{row.server_ms_a_frame:.2f}")
         for row in rows
     ]
-    held = median(now.vehicles) / max(1, median(before.vehicles))
-    spent = before.server_ms_a_frame / now.server_ms_a_frame
-    told = f"{held:.2f} times as many vehicles (medians); {spent:.2f} times as many frames a second"
-    columns = ("code", "vehicles held", "server, ms a frame")
-    return "\n\n".join(
-        [heading(path, result), table(columns, cells), f"{told} of the server's processor.", ""]
+    yield text_table(
+        ("code", "vehicles held", "server, ms a frame"), lines, "Two revisions in turn"
+    )
+    yield (
+        f"{held:.2f} times as many vehicles (medians); {spent:.2f} times as many frames a second "
+        "of the server's processor."
     )
 
 
-def _shown(row: LoadRow, column: str) -> str:
-    if column == "link":
-        return row.link or "loopback"
-    if column == "held":
-        return "yes" if row.held else "no"
-    return cell(getattr(row, column))
-
-
-def _note(row: RecordedLoad) -> str:
-    broken = f" Not kept: {'; '.join(row.broken)}." if row.broken else ""
-    size = f"{row.width}x{row.height}, {row.payload_bytes:.0f} bytes of payload a frame"
-    return f"* `{row.command}` at `{row.revision}` ({row.kind} vehicles, {size}).{broken}"
+LOADS = Report(
+    "loadtest",
+    "What a server carries",
+    "Latency and processor time of a server under prerecorded and live vehicles.",
+    _load_parts,
+    bars("p99 ms from due to acknowledged", _load_bars),
+)
+RATIO = Report(
+    "load-ratio",
+    "What a server carries now and before",
+    "How many vehicles two revisions of the server held, measured in turn.",
+    _ratio_parts,
+)
 
 
 def main(arguments: list[str]) -> int:

@@ -15,13 +15,15 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lab.paper.report import PaperRow, means_of, savings_by_frame
+from lab.paper.report import PaperRow, means_of, paper_parts, paper_rows, savings_by_frame
+from lab.report import Report
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfedge.evaluate.picture_quality import BANDS
 from rfedge.report.charts import LINES, MARKERS, STYLE, write_figure
+from rfedge.results import Result
 
-__all__ = ["write_paper_figures", "write_views"]
+__all__ = ["REPORT", "write_paper_figures", "write_views"]
 
 
 mpl.use("svg")
@@ -65,21 +67,21 @@ PUBLISHED_FIGURES = {
 """By kind of scene (what follows the last hyphen of its name) and field."""
 
 
-def write_paper_figures(rows: Sequence[PaperRow], folder: Path) -> list[Path]:
-    """Write a plot of savings per image for each field and scene, one by CRF and preset, and one
-    of what the renders miss by spatial frequency.
+def write_paper_figures(result: Result, folder: Path, _name: str) -> list[Path]:
+    """Write a plot of savings by CRF and preset, one of savings per image for each field and scene,
+    and one of what the renders miss by spatial frequency.
 
     Raises ``InvalidInput`` without rows.
     """
+    rows = paper_rows(result)
     if not rows:
         raise InvalidInput("rows", "there is none to draw")
     folder.mkdir(parents=True, exist_ok=True)
     pairs = dict.fromkeys((row.field, row.scene) for row in rows if not row.is_control)
-    written = []
+    written = write_figure(folder / "savings_by_crf_preset", *_by_setting(rows))
     for field, scene in pairs:
         curves = savings_by_frame(rows, field, scene)
         written += write_figure(folder / _savings_name(field, scene), *_per_image(curves))
-    written += write_figure(folder / "savings_by_crf_preset", *_by_setting(rows))
     return written + write_figure(folder / "residual_by_frequency", *_by_band(rows))
 
 
@@ -92,7 +94,7 @@ def _savings_name(field: str, scene: str) -> str:
 
 def _by_band(rows: Sequence[PaperRow]) -> tuple[Figure, list[list[str]]]:
     """Residual energy over the camera's by band, a line per size, mean over scenes, by field."""
-    means = [m for m in means_of(rows) if ":" not in m.field and m.making == "downscaled"]
+    means = [m for m in means_of(rows) if ":" not in m.name and m.making == "downscaled"]
     names = [f"{low:.3g}..{high:.3g}" for low, high in BANDS]
     lines = [["field", "scene", "size", *names]]
     with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
@@ -100,17 +102,17 @@ def _by_band(rows: Sequence[PaperRow]) -> tuple[Figure, list[list[str]]]:
         sizes = list(dict.fromkeys(mean.size_px for mean in means))
         for mean in means:
             size = "{}x{}".format(*mean.size_px)
-            lines.append([mean.field, mean.scene, size, *(f"{ratio:.4f}" for ratio in mean.bands)])
+            lines.append([mean.name, mean.scene, size, *(f"{ratio:.4f}" for ratio in mean.bands)])
             index = sizes.index(mean.size_px)
             axes.plot(
                 names,
                 mean.bands,
                 color=LINES[index % len(LINES)],
-                marker=MARKERS[list(dict.fromkeys(m.field for m in means)).index(mean.field) % 4],
+                marker=MARKERS[list(dict.fromkeys(m.name for m in means)).index(mean.name) % 4],
                 linestyle="-" if mean.scene == means[0].scene else "--",
                 markersize=4,
                 linewidth=1.5,
-                label=f"{mean.field}, {mean.scene}, {size}",
+                label=f"{mean.name}, {mean.scene}, {size}",
             )
         axes.set(xlabel="cycles a pixel", ylabel="residual / camera energy", yscale="log")
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=7)
@@ -164,3 +166,13 @@ def _mean_of(rows: Sequence[PaperRow], field: str, setting: tuple[str, float]) -
         if row.field == field and (row.preset, row.crf) == setting
     ]
     return float(np.mean(chosen))
+
+
+REPORT = Report(
+    "paper",
+    "The published experiment",
+    "What the published two-frame clip saves by the published metric, beside controls that know "
+    "nothing of the place and beside an I picture of equal quality.",
+    paper_parts,
+    write_paper_figures,
+)

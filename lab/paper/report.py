@@ -1,4 +1,4 @@
-"""What the published experiment's rows say: means, savings frame by frame, and the page's section.
+"""What the rows of the published experiment say: means, savings frame by frame, and tables.
 
 The savings of a frame are its mean over presets and rate factors; spreads are over frames. Beside
 the published metric, which compares pictures of two contents and qualities, stands what a P picture
@@ -8,17 +8,15 @@ takes of an I picture of the same frame at its quality.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from rfcore.errors import InvalidInput
-from rfedge.report.tables import heading, print_table, table
+from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
 __all__ = [
@@ -27,10 +25,9 @@ __all__ = [
     "PaperTable",
     "SettingColumns",
     "means_of",
+    "paper_parts",
     "paper_rows",
-    "paper_section",
     "paper_tables",
-    "print_means",
     "savings_by_frame",
 ]
 
@@ -57,19 +54,19 @@ class PaperRow:
     savings_percent: float
     """100 I / (I + P)."""
     i_psnr_db: float | None
-    """Of the I picture against the render; None where they are identical, as all PSNRs here."""
+    """PSNR of the I picture against the render; None if they are identical, as all PSNRs here."""
     psnr_db: float | None
     ssim: float
     camera_i_bytes: int
     """The camera frame coded by itself."""
     camera_i_psnr_db: float | None
     rf_psnr_db: float
-    """Of the render against the camera, as ``rf_ssim``, ``rf_residual_bands`` and ``rf_flip``."""
+    """PSNR of the render against the camera, as ``rf_ssim``, ``rf_residual_bands``, ``rf_flip``."""
     rf_ssim: float
     rf_residual_bands: Sequence[float]
     """Energy of the difference over the camera's, by band of spatial frequency."""
     rf_flip: float | None = None
-    """Of neither controls nor native renders."""
+    """FLIP of the render; None of controls and native renders."""
 
     @staticmethod
     def of(row: Mapping[str, Any]) -> PaperRow:
@@ -94,7 +91,7 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class SettingColumns:
-    """What ``PaperRow`` says of each frame at one preset and CRF, in the order of the frames."""
+    """The columns of ``PaperRow`` at one preset and CRF, a value a frame in their order."""
 
     preset: str
     crf: float
@@ -149,8 +146,6 @@ def paper_tables(rows: Sequence[PaperRow]) -> list[PaperTable]:
 
 def paper_rows(result: Result) -> list[PaperRow]:
     """Return the rows of a result of ``rfedge-lab paper``."""
-    if "rows" in result:  # older files
-        return rows_of(PaperRow, result["rows"])
     return [row for table in rows_of(PaperTable, result["tables"]) for row in _rows_of_table(table)]
 
 
@@ -240,19 +235,23 @@ class PaperMean:
     is; ``second_not_p`` is the share of such clips.
     """
 
-    field: str
-    scene: str
+    name: str = field(metadata=shown("field"))
+    """Name of the field."""
+    scene: str = field(metadata=shown("scene"))
     size_px: tuple[int, int]
-    making: str
+    making: str = field(metadata=shown("render"))
     frames: int
-    savings_percent: float
-    sd_percent: float
-    ci95_percent: float
-    against_intra_percent: float | None
-    """What P pictures at the middle CRF take more than I pictures of the same frames and PSNR."""
-    rf_psnr_db: float
-    rf_ssim: float
-    rf_flip: float | None
+    savings_percent: float = field(metadata=shown("100 I/(I+P) %", ".1f"))
+    sd_percent: float = field(metadata=shown("sd", ".1f"))
+    ci95_percent: float = field(metadata=shown("95 %, ±", ".1f"))
+    against_intra_percent: float | None = field(
+        metadata=shown("P against I of its PSNR, %", "+.1f")
+    )
+    """Bytes of P pictures at the middle CRF above those of I pictures of the same frames and
+    PSNR."""
+    rf_psnr_db: float = field(metadata=shown("RF dB", ".2f"))
+    rf_ssim: float = field(metadata=shown("SSIM", ".3f"))
+    rf_flip: float | None = field(metadata=shown("FLIP", ".3f"))
     bands: tuple[float, ...]
     second_not_p: float
 
@@ -286,7 +285,7 @@ def _mean(group: Sequence[PaperRow]) -> PaperMean:
     sd = float(np.std(savings, ddof=1)) if len(savings) > 1 else 0.0
     flips = [(row.frame, row.rf_flip) for row in group if row.rf_flip is not None]
     return PaperMean(
-        field=first.field,
+        name=first.field,
         scene=first.scene,
         size_px=first.size_px,
         making=first.render,
@@ -335,67 +334,29 @@ def _by_frame(values: Sequence[tuple[str, float]]) -> NDArray[np.float64]:
     return np.array([np.mean(of_frame) for of_frame in frames.values()])
 
 
-COLUMNS = (
-    "field",
-    "scene",
-    "size",
-    "render",
-    "frames",
-    "100 I/(I+P) %",
-    "sd",
-    "95 %",
-    "P against I of its PSNR %",
-    "RF dB",
-    "SSIM",
-    "LPIPS",
-    "FLIP",
-    "residual by band",
+NAMES = ("name", "scene")
+SIZE = Column("size", lambda mean: mean.size_px, "{}x{}")
+WORDS = (
+    "Means over presets and CRFs, then over frames. `name:behind` and `name:grey` are controls "
+    "(medium, CRF 23). Residual: luma energy of camera - render over the camera's, by cycles a "
+    "pixel {bands}. LPIPS {lpips}."
 )
-PRINTED = (*COLUMNS[:4], *COLUMNS[5:11], "FLIP")
 
 
-def paper_section(path: Path, result: Result) -> str:
-    """Return the published experiment's table; means over presets and CRFs, then over frames."""
+def paper_parts(result: Result) -> Iterator[Table | str]:
+    """Yield the savings by the published metric, and the quality of the renders."""
     means = means_of(paper_rows(result))
-    rows = [
-        [
-            *_cells(mean)[:4],
-            str(mean.frames),
-            *_cells(mean)[4:],
-            "n/a",
-            _flip(mean),
-            " / ".join(f"{ratio:.2f}" for ratio in mean.bands),
-        ]
-        for mean in means
-    ]
+    same = (*NAMES, SIZE, "making")
+    savings = ("savings_percent", "sd_percent", "ci95_percent", "against_intra_percent")
+    yield Table("Published metric", columns(PaperMean, *same, *savings), means)
+    quality = ("rf_psnr_db", "rf_ssim", "rf_flip", BANDS_TEXT)
+    yield Table("Renders against the camera", columns(PaperMean, *same, *quality), means)
     bands = ", ".join("{:.3g}..{:.3g}".format(*band) for band in result["bands_cycles_per_px"])
-    note = (
-        "`name:behind` and `name:grey` are controls (medium, CRF 23). Residual: luma energy of "
-        f"camera - render over the camera's, by cycles a pixel {bands}. LPIPS {result['lpips']}."
-    )
-    return "\n\n".join([heading(path, result), table(COLUMNS, rows), note, ""])
+    frames = ", ".join(map(str, dict.fromkeys(mean.frames for mean in means)))
+    yield "Camera and renders of the first frames: [views](figures/fig2_views.svg)."
+    yield f"{frames} frames. " + WORDS.format(bands=bands, lpips=result["lpips"])
 
 
-def print_means(console: Console, rows: Sequence[PaperRow]) -> None:
-    """Print the means with their spread, and the quality of the render itself."""
-    cells = [[*_cells(mean), _flip(mean)] for mean in means_of(rows)]
-    print_table(console, "Published metric, means over frames", PRINTED, cells)
-
-
-def _cells(mean: PaperMean) -> list[str]:
-    return [
-        mean.field,
-        mean.scene,
-        "{}x{}".format(*mean.size_px),
-        mean.making,
-        f"{mean.savings_percent:.1f}",
-        f"{mean.sd_percent:.1f}",
-        f"±{mean.ci95_percent:.1f}",
-        "-" if mean.against_intra_percent is None else f"{mean.against_intra_percent:+.1f}",
-        f"{mean.rf_psnr_db:.2f}",
-        f"{mean.rf_ssim:.3f}",
-    ]
-
-
-def _flip(mean: PaperMean) -> str:
-    return "-" if mean.rf_flip is None else f"{mean.rf_flip:.3f}"
+BANDS_TEXT = Column(
+    "residual by band", lambda mean: " / ".join(f"{ratio:.2f}" for ratio in mean.bands)
+)

@@ -1,11 +1,9 @@
-"""The published experiment over drives and fields: one result file, its figures and their numbers.
+"""Run the published experiment over drives and fields; write one result file.
 
-Cells are one frame at one size; their rows run over presets and rate factors. Two controls stand
-beside every field, as render: ``grey`` knows nothing, ``behind`` is the field itself seen in the
-opposite direction, the right kind of picture of the wrong place. They are rendered at the size they
-are coded at, and at the largest of several sizes not at all: a hash grid takes long there.
-
-The experiment as published, frame by frame: rows as its tables need them.
+A finished piece is one frame at one size; its rows run over presets and rate factors. Two controls
+stand beside every field, as render: ``grey`` knows nothing, ``behind`` is the field itself seen in
+the opposite direction, the right kind of picture of the wrong place. They are rendered at the size
+they are coded at, and at the largest of several sizes not at all: a hash grid takes long there.
 
 ``published_rows`` codes the two-frame clip of ``rfedge.evaluate.savings`` at every size,
 preset and CRF; the camera frame alone, coded the same way, says what an I picture of it costs.
@@ -27,7 +25,8 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
-from lab.paper.report import PaperRow, paper_tables
+from lab.paper import EvalPaper
+from lab.paper.report import PaperRow, paper_parts, paper_tables
 from rfcore.camera import Camera, Pose
 from rfcore.codec.h264.config import CodecConfig, effort_of_preset
 from rfcore.codec.h264.ffmpeg import decode_clip
@@ -40,13 +39,6 @@ from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.views import PosedPicture
 from rfedge.arguments import open_field
-from rfedge.evaluate.cells import (
-    CellStore,
-    Rows,
-    check_processes,
-    each_done,
-    program_version,
-)
 from rfedge.evaluate.picture_quality import (
     BANDS,
     RenderQuality,
@@ -54,13 +46,14 @@ from rfedge.evaluate.picture_quality import (
     flip,
     render_quality,
 )
+from rfedge.evaluate.runner import Run, program_version
 from rfedge.evaluate.savings import (
     intra_alone,
     published_clip,
     savings_of_clip,
     slice_nals,
 )
-from rfedge.results import check_result_path, make_result, provenance, write_result
+from rfedge.jobs import CellStore, Job, Rows, Tell
 
 with needs("eval"):
     import cv2
@@ -68,7 +61,6 @@ with needs("eval"):
 __all__ = [
     "PUBLISHED_CRFS",
     "PUBLISHED_PRESETS",
-    "PaperJob",
     "PublishedFrame",
     "Setting",
     "named_path",
@@ -192,28 +184,6 @@ TURNED_ROUND = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 QUICK_FRAMES = 2
 
 
-@dataclass(frozen=True)
-class PaperJob:
-    """What to run; see ``rfedge-lab paper --help``. ``fields`` and ``drives`` are NAME=PATH."""
-
-    fields: tuple[str, ...]
-    drives: tuple[str, ...]
-    sizes_px: tuple[Size, ...]
-    out: Path
-    cells: Path
-    every: int = 1
-    quick: bool = False
-    processes: int = 1
-
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-        if not (self.fields and self.drives and self.sizes_px):
-            raise InvalidInput("paper", "needs at least one field, one drive and one size")
-        check_processes(self.processes)
-        if self.every < 1:
-            raise InvalidInput("every", f"{self.every} must be at least 1")
-
-
 @dataclass(frozen=True, eq=False)
 class DriveFrame:
     """One frame of one drive, with what its fields and sizes share."""
@@ -224,7 +194,7 @@ class DriveFrame:
 
     @cached_property
     def digest(self) -> str:
-        """Of pixels and camera."""
+        """The digest of pixels and camera."""
         pose = repr(self.picture.camera).encode()
         return hashlib.sha256(_pixels_of(self).tobytes() + pose).hexdigest()
 
@@ -238,8 +208,8 @@ class NamedField:
 
 
 @dataclass(frozen=True)
-class Piece:
-    """One frame of one drive, one field and one size; with controls beside it or without."""
+class Shot:
+    """One frame of one drive, one field and one size, with controls beside it or without."""
 
     source: DriveFrame
     opened: NamedField
@@ -255,61 +225,60 @@ def named_path(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
-def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
-    """Run what is not there yet, write ``job.out`` and return its content.
+def run_paper(job: EvalPaper, console: Console) -> dict[str, Any]:
+    """Run what is not there yet, write the result and print the means.
 
     Raises ``InvalidInput``, ``DatasetError`` or ``FieldFormatError`` before anything is coded if an
     input is wrong.
     """
     require("eval", "flip_evaluator")
     fields = _opened(job)
-    pieces = list(_pieces(job, fields))
-    store = CellStore(job.cells)
-    made = provenance(path for _, path in map(named_path, (*job.fields, *job.drives)))
-    pictures = _by_picture(job, pieces)
-    _say_cost(pictures, store, console, job.processes)
-    if job.processes > 1:
-        for _ in each_done(partial(_picture_done, job), range(len(pictures)), job.processes):
-            pass
-    rows = [row for piece in pieces for row in store.rows(_key(piece), _maker(piece))]
+    shots = list(_shots(job, fields))
+    inputs = [path for _, path in map(named_path, (*job.fields, *job.drives))]
+    run = Run.begin("paper", job, inputs, console)
+    pictures = _by_picture(job, shots)
+    _say_cost(pictures, run, job.processes)
+    jobs = [
+        Job(f"picture-{number + 1}", partial(_code_picture, job, number))
+        for number in range(len(pictures))
+    ]
+    run.parallel(jobs, job.processes)
+    rows = [row for shot in shots for row in run.store.rows(_key(shot), _maker(shot))]
     content = {
-        "quick": job.quick,
         "field_ids": {opened.name: opened.field.field_id for opened in fields},
         "lpips": "n/a: no weights",
         "bands_cycles_per_px": BANDS,
         "tables": paper_tables([PaperRow.of(row) for row in rows]),
     }
-    result = make_result("paper", made, content)
-    write_result(job.out, result)
-    return result
+    return run.finish(content, paper_parts)
 
 
-def _opened(job: PaperJob) -> list[NamedField]:
+def _opened(job: EvalPaper) -> list[NamedField]:
     return [NamedField(name, open_field(path)) for name, path in map(named_path, job.fields)]
 
 
-def _picture_done(job: PaperJob, number: int) -> None:
-    """Have the rows of the job's picture of that number among the cells."""
+def _code_picture(job: EvalPaper, number: int, _tell: Tell) -> None:
+    """Keep the rows of the job's picture of that number."""
     _keep_rows(_pictures_of_process(job)[number], CellStore(job.cells))
 
 
-def _keep_rows(pieces: Sequence[Piece], store: CellStore) -> None:
-    for piece in pieces:
-        store.rows(_key(piece), _maker(piece))
+def _keep_rows(shots: Sequence[Shot], store: CellStore) -> None:
+    for shot in shots:
+        store.rows(_key(shot), _maker(shot))
 
 
 @lru_cache(maxsize=1)
-def _pictures_of_process(job: PaperJob) -> list[Sequence[Piece]]:
-    return _by_picture(job, list(_pieces(job, _opened(job))))
+def _pictures_of_process(job: EvalPaper) -> list[Sequence[Shot]]:
+    return _by_picture(job, list(_shots(job, _opened(job))))
 
 
-def _by_picture(job: PaperJob, pieces: Sequence[Piece]) -> list[Sequence[Piece]]:
-    """Return the pieces of each picture, which follow one another: every field, every size."""
+def _by_picture(job: EvalPaper, shots: Sequence[Shot]) -> list[Sequence[Shot]]:
+    """Return the shots of each picture, which follow one another: every field, every size."""
     each = len(job.fields) * len(job.sizes_px)
-    return [pieces[first : first + each] for first in range(0, len(pieces), each)]
+    return [shots[first : first + each] for first in range(0, len(shots), each)]
 
 
-def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
+def views_of(job: EvalPaper) -> list[tuple[str, Rgb]]:
     """Return the first frame of each drive as the camera has it and as each field renders it."""
     views = []
     for scene, path in map(named_path, job.drives):
@@ -320,7 +289,7 @@ def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
     return views
 
 
-def _pieces(job: PaperJob, fields: Sequence[NamedField]) -> Iterator[Piece]:
+def _shots(job: EvalPaper, fields: Sequence[NamedField]) -> Iterator[Shot]:
     for scene, path in map(named_path, job.drives):
         pictures = read_dataset(path).pictures[:: job.every]
         pictures = pictures[: QUICK_FRAMES if job.quick else None]
@@ -329,82 +298,82 @@ def _pieces(job: PaperJob, fields: Sequence[NamedField]) -> Iterator[Piece]:
             for opened in fields:
                 for size_px in job.sizes_px:
                     controlled = size_px != max(job.sizes_px) or len(job.sizes_px) == 1
-                    yield Piece(frame, opened, size_px, controlled)
+                    yield Shot(frame, opened, size_px, controlled)
 
 
-def _key(piece: Piece) -> dict[str, str | float | int | None]:
+def _key(shot: Shot) -> dict[str, str | float | int | None]:
     return {
-        "field": piece.opened.field.field_id,
-        "field_name": piece.opened.name,
-        "scene": piece.source.scene,
-        "frame": piece.source.picture.name,
-        "input": piece.source.digest,
-        "width": piece.size_px[0],
-        "height": piece.size_px[1],
-        "controlled": piece.controlled,
+        "field": shot.opened.field.field_id,
+        "field_name": shot.opened.name,
+        "scene": shot.source.scene,
+        "frame": shot.source.picture.name,
+        "input": shot.source.digest,
+        "width": shot.size_px[0],
+        "height": shot.size_px[1],
+        "controlled": shot.controlled,
         "program": program_version(),
     }
 
 
-def _maker(piece: Piece) -> Any:
-    return lambda: list(_rows(piece))
+def _maker(shot: Shot) -> Any:
+    return lambda: list(_rows(shot))
 
 
-def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
+def _rows(shot: Shot) -> Iterator[dict[str, Any]]:
     settings = [
-        Setting(piece.size_px, making, preset, crf)
-        for making in _makings(piece)
+        Setting(shot.size_px, making, preset, crf)
+        for making in _makings(shot)
         for preset in PUBLISHED_PRESETS
         for crf in PUBLISHED_CRFS
     ]
-    frame = _published_frame(piece, piece.source.picture.camera)
-    size_px = piece.size_px
+    frame = _published_frame(shot, shot.source.picture.camera)
+    size_px = shot.size_px
     difference = flip(frame.render(size_px, "downscaled"), reduced(frame.camera, size_px))
-    for row in _labelled(piece, piece.opened.name, frame, settings):
+    for row in _labelled(shot, shot.opened.name, frame, settings):
         yield row if row["render"] == "native" else {**row, "rf_flip": difference}
-    if piece.controlled:
-        yield from _control_rows(piece)
+    if shot.controlled:
+        yield from _control_rows(shot)
 
 
-def _control_rows(piece: Piece) -> Iterator[dict[str, Any]]:
-    control = [Setting(piece.size_px, _makings(piece)[-1], CONTROL_PRESET, CONTROL_CRF)]
-    camera = piece.source.picture.camera
+def _control_rows(shot: Shot) -> Iterator[dict[str, Any]]:
+    control = [Setting(shot.size_px, _makings(shot)[-1], CONTROL_PRESET, CONTROL_CRF)]
+    camera = shot.source.picture.camera
     behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))
     yield from _labelled(
-        piece, f"{piece.opened.name}:behind", _published_frame(piece, behind), control
+        shot, f"{shot.opened.name}:behind", _published_frame(shot, behind), control
     )
     grey = np.full((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), 128, np.uint8)
     without_field = PublishedFrame(
-        piece.source.picture.name,
-        _pixels_of(piece.source),
+        shot.source.picture.name,
+        _pixels_of(shot.source),
         lambda size_px, _making: reduced(grey, size_px),
-        piece.source.alone,
+        shot.source.alone,
     )
-    yield from _labelled(piece, f"{piece.opened.name}:grey", without_field, control)
+    yield from _labelled(shot, f"{shot.opened.name}:grey", without_field, control)
 
 
-def _makings(piece: Piece) -> Sequence[Making]:
-    k = piece.source.picture.camera.intrinsics
-    full = piece.size_px == (k.width_px, k.height_px)
+def _makings(shot: Shot) -> Sequence[Making]:
+    k = shot.source.picture.camera.intrinsics
+    full = shot.size_px == (k.width_px, k.height_px)
     return ("downscaled",) if full else ("downscaled", "native")
 
 
-def _labelled(piece: Piece, label: str, frame: PublishedFrame, settings: Sequence[Setting]) -> Rows:
+def _labelled(shot: Shot, label: str, frame: PublishedFrame, settings: Sequence[Setting]) -> Rows:
     return [
-        {"field": label, "scene": piece.source.scene, **row}
+        {"field": label, "scene": shot.source.scene, **row}
         for row in published_rows(frame, settings)
     ]
 
 
-def _published_frame(piece: Piece, camera: Camera) -> PublishedFrame:
+def _published_frame(shot: Shot, camera: Camera) -> PublishedFrame:
     def render(size_px: Size, making: Making) -> Rgb:
         if making == "downscaled":
-            return reduced(_at_own_size(piece.opened, camera), size_px)
+            return reduced(_at_own_size(shot.opened, camera), size_px)
         return _render(
-            piece.opened.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
+            shot.opened.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
         )
 
-    source = piece.source
+    source = shot.source
     return PublishedFrame(source.picture.name, _pixels_of(source), render, source.alone)
 
 
@@ -424,18 +393,16 @@ def _render(field: RadianceField, camera: Camera) -> Rgb:
     return rgb_from_colour(field.render_colour(camera))
 
 
-def _say_cost(
-    pictures: Sequence[Sequence[Piece]], store: CellStore, console: Console, processes: int
-) -> None:
+def _say_cost(pictures: Sequence[Sequence[Shot]], run: Run, processes: int) -> None:
     """Do the first picture that is not whole, and say what the others will take.
 
     A whole picture, for its sizes share what reading it and rendering it at full size take.
     """
-    left = [pieces for pieces in pictures if not all(store.has(_key(piece)) for piece in pieces)]
+    left = [shots for shots in pictures if not all(run.store.has(_key(shot)) for shot in shots)]
     estimate = "nothing left to do"
     if left:
         began_s = monotonic()
-        _keep_rows(left[0], store)
+        _keep_rows(left[0], run.store)
         total_s = (monotonic() - began_s) * (len(left) - 1)
         estimate = f"{len(left)} left, about {total_s / processes / 60:.1f} minutes"
-    console.print(f"{len(pictures)} pictures, {estimate}")
+    run.tell(f"{len(pictures)} pictures, {estimate}")

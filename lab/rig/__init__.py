@@ -47,10 +47,11 @@ class EvalRig:
         """Run, write the rows, print them."""
         from rich.console import Console
 
-        from lab.rig.report import print_rig
+        from lab.rig.report import rig_parts
         from lab.rig.run import RigJob, run_rig
         from rfcore.dataset.rig import read_rig
         from rfedge.arguments import field_path
+        from rfedge.report.tables import Table
         from rfedge.results import write_result
 
         job = RigJob(
@@ -70,4 +71,6 @@ class EvalRig:
         console = Console()
         result = run_rig(job, console)
         write_result(self.out, result)
-        print_rig(console, result)
+        for part in rig_parts(result):
+            if isinstance(part, Table):
+                part.print(console)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional
 
-from rfcore.codec.h264.config import DEFAULT_EFFORT
+from rfcore.codec.h264.config import DEFAULT_EFFORT, check_effort
+from rfcore.errors import InvalidInput
+from rfedge.evaluate import Experiment
 from rfedge.samples import sample_path
 
 __all__ = ["EvalRobust"]
 
 
-@dataclass(frozen=True)
-class EvalRobust:
+@dataclass(frozen=True, kw_only=True)
+class EvalRobust(Experiment):
     """Send a drive over a lossy link, with noisy poses, and in another light.
 
     Loss comes in bursts on a datagram link with a virtual clock; every method is compared at one
@@ -33,7 +35,7 @@ class EvalRobust:
     lane: str | None = None
     """NAME@HZ=DATASET of a drive in another lane than the training views."""
     effort: str = DEFAULT_EFFORT
-    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
+    """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: str = "veryfast"
     """x264 preset of the others."""
     quality_db: float = 33.0
@@ -45,42 +47,34 @@ class EvalRobust:
     rtts_ms: tuple[float, ...] = (20.0, 50.0, 100.0)
     """Round trips of the lossy link."""
     out: Path = Path("out/eval/robust.json")
-    """The result file to write."""
     figures: Path = Path("out/eval/figures")
     """Folder of the figure (SVG, and CSV with its numbers)."""
     cells: Path = Path("out/eval/robust")
-    """Folder of finished pieces."""
     processes: int = 1
     """How many processes send at once; the rows do not depend on it."""
-    quick: bool = False
-    """Eight frames and the extremes alone: to see that it works, not for figures."""
+
+    def __post_init__(self) -> None:
+        from rfedge.jobs import check_processes
+
+        super().__post_init__()
+        check_effort("effort", self.effort)
+        if self.frames < 4:
+            raise InvalidInput("frames", f"{self.frames} must be at least 4")
+        if not 1 <= self.seeds <= 10_000:
+            raise InvalidInput("seeds", f"{self.seeds} is outside 1..10,000")
+        check_processes(self.processes)
+        if not self.rtts_ms or not all(0 <= rtt_ms <= 10_000 for rtt_ms in self.rtts_ms):
+            raise InvalidInput("rtts_ms", f"{self.rtts_ms} must be some of 0..10,000 ms")
 
     def run(self) -> None:
         """Do what is not done yet, write rows and figure, print what came out."""
         from rich.console import Console
 
-        from lab.robust.report import print_robust, write_robust_figure
-        from lab.robust.run import RobustJob, run_robust
+        from lab.robust.report import write_robust_figure
+        from lab.robust.run import run_robust
         from rfedge.arguments import field_path
 
-        job = RobustJob(
-            field=field_path(self.field),
-            drive=self.drive,
-            dusk=self.dusk,
-            lane=self.lane,
-            effort=self.effort,
-            preset=self.preset,
-            quality_db=self.quality_db,
-            frames=self.frames,
-            out=self.out,
-            cells=self.cells,
-            quick=self.quick,
-            seeds=self.seeds,
-            rtts_ms=self.rtts_ms,
-            processes=self.processes,
-        )
         console = Console()
-        result = run_robust(job, console)
-        print_robust(console, result)
-        for path in write_robust_figure(result, self.figures):
+        result = run_robust(replace(self, field=field_path(self.field)), console)
+        for path in write_robust_figure(result, self.figures, "robust"):
             console.print(f"  {path}")

@@ -1,24 +1,24 @@
-"""The robustness experiment's rows, as a figure and as a section of the results page."""
+"""The robustness experiment's rows, as tables and as a figure."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
+from lab.report import Report
 from rfcore.errors import InvalidInput
-from rfedge.report.tables import heading, print_table, table
+from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
 __all__ = [
+    "REPORT",
     "CrossingRow",
     "DisturbanceRow",
     "LossRow",
-    "print_robust",
-    "robust_section",
+    "robust_parts",
     "write_robust_figure",
 ]
 
@@ -40,7 +40,7 @@ class CrossingRow:
     """Frames at which a viewer still saw an earlier picture."""
     frames: int
     seed: int = 5
-    """Of the losses; earlier records had this one and did not say so."""
+    """Seed of the losses."""
 
 
 @dataclass(frozen=True)
@@ -48,107 +48,62 @@ class LossRow:
     """SSIM of one method at the rate that all are compared at, interpolated between CRFs: means
     over the seeds of loss."""
 
-    method: str
-    rtt_ms: float
-    loss_percent: float
-    ssim: float
-    ssim_p5: float
-    seeds: int = 1
-    ssim_ci95: Sequence[float] | None = None
-    """Of the mean over the seeds; None for one seed."""
+    method: str = field(metadata=shown("method"))
+    rtt_ms: float = field(metadata=shown("RTT ms", "g"))
+    loss_percent: float = field(metadata=shown("loss %", "g"))
+    ssim: float = field(metadata=shown("SSIM", ".4f"))
+    ssim_p5: float = field(metadata=shown("worst 5 % of frames", ".4f"))
+    seeds: int = field(default=1, metadata=shown("seeds"))
+    ssim_ci95: Sequence[float] | None = field(
+        default=None, metadata=shown("95 %", "{:.4f}..{:.4f}")
+    )
+    """Interval of the mean over the seeds; None for one seed."""
 
 
 @dataclass(frozen=True)
 class DisturbanceRow:
     """Kilobits a frame at equal quality under one disturbance, or the reason why not."""
 
-    condition: str
+    condition: str = field(metadata=shown("condition"))
     level: str
     reason: str | None = None
-    kbit: float | None = None
-    more_percent: float | None = None
-    """Against ours undisturbed."""
-    x264_kbit: float | None = None
-    against_x264_percent: float | None = None
-    frames_found: int | None = None
-    """Whose poses were refined."""
+    kbit: float | None = field(default=None, metadata=shown("kbit a frame", ".1f"))
+    more_percent: float | None = field(default=None, metadata=shown("more %", "+.1f"))
+    """Bits above those of ours undisturbed."""
+    x264_kbit: float | None = field(default=None, metadata=shown("x264 kbit", ".1f"))
+    against_x264_percent: float | None = field(
+        default=None, metadata=shown("against x264, %", "+.1f")
+    )
+    frames_found: int | None = field(default=None, metadata=shown("frames found"))
+    """Number of frames whose poses were refined."""
 
 
-LOSS_COLUMNS = ("method", "loss %", "RTT ms", "seeds", "SSIM", "95 %", "worst 5 % of frames")
-REST_COLUMNS = (
-    "condition",
-    "level",
-    "frames found",
-    "kbit a frame",
-    "more %",
-    "x264",
-    "against x264 %",
-)
+LEVEL = Column("level", lambda row: row.level if row.reason is None else f"n/a: {row.reason}")
 
 
-def robust_section(path: Path, result: Result) -> str:
-    """Return the tables: SSIM over a lossy link at one rate, and bits under disturbed poses."""
+def robust_parts(result: Result) -> Iterator[Table | str]:
+    """Yield SSIM over a lossy link at one rate, and bits under disturbed poses and light."""
     frames = result["frames"]
-    notes = (
+    yield (
         f"{frames['count']} frames of `{frames['drive']}`. Loss: bursts of two datagrams of 1200 "
         f"bytes on average, no repetition; the mean SSIM against the camera of what a viewer sees, "
         f"at one total rate, {result['equal_rate_kbps']:.0f} kbit/s, interpolated between CRFs. "
-        "last-sent, last-acked and render-only are ours: which frame is predicted from."
+        "last-sent, last-acked and render-only are ours: which frame is predicted from. The "
+        "product sends over TCP instead, where loss costs time and no picture is damaged."
     )
-    rest = (
-        f"Without loss: bits at {result['quality_db']:g} dB, ours against ours undisturbed and "
-        "against low-delay x264."
-    )
-    loss = [
-        _loss_cells(row)
-        for row in sorted(
-            rows_of(LossRow, result["rows"]), key=lambda row: (row.loss_percent, row.rtt_ms)
-        )
-    ]
-    disturbed = [_disturbed_cells(row) for row in rows_of(DisturbanceRow, result["disturbances"])]
-    return "\n\n".join(
-        [
-            heading(path, result),
-            notes,
-            table(LOSS_COLUMNS, loss),
-            rest,
-            table(REST_COLUMNS, disturbed),
-            "",
-        ]
+    lossy = sorted(rows_of(LossRow, result["rows"]), key=lambda row: (row.loss_percent, row.rtt_ms))
+    title = f"SSIM over a lossy link, all at {result['equal_rate_kbps']:.0f} kbit/s"
+    yield Table(title, columns(LossRow), lossy)
+    disturbed = rows_of(DisturbanceRow, result["disturbances"])
+    wanted = ("condition", LEVEL, "frames_found", "kbit", "more_percent", "x264_kbit")
+    yield Table(
+        f"Without loss: bits at {result['quality_db']:g} dB, ours against ours undisturbed",
+        columns(DisturbanceRow, *wanted, "against_x264_percent"),
+        disturbed,
     )
 
 
-def print_robust(console: Console, result: Result) -> None:
-    """Print both tables."""
-    rate = f"SSIM over a lossy link, all at {result['equal_rate_kbps']:.0f} kbit/s"
-    loss = [_loss_cells(row) for row in rows_of(LossRow, result["rows"])]
-    print_table(console, rate, LOSS_COLUMNS, loss)
-    bits = f"Bits at {result['quality_db']:g} dB"
-    disturbed = [_disturbed_cells(row) for row in rows_of(DisturbanceRow, result["disturbances"])]
-    print_table(console, bits, REST_COLUMNS, disturbed)
-
-
-def _loss_cells(row: LossRow) -> list[str]:
-    interval = "-" if row.ssim_ci95 is None else "{:.4f}..{:.4f}".format(*row.ssim_ci95)
-    link = (f"{row.loss_percent:g}", f"{row.rtt_ms:g}", str(row.seeds))
-    return [row.method, *link, f"{row.ssim:.4f}", interval, f"{row.ssim_p5:.4f}"]
-
-
-def _disturbed_cells(row: DisturbanceRow) -> list[str]:
-    if row.reason is not None:
-        return [row.condition, f"n/a: {row.reason}", *["n/a"] * (len(REST_COLUMNS) - 2)]
-    return [
-        row.condition,
-        row.level,
-        "-" if row.frames_found is None else str(row.frames_found),
-        f"{row.kbit:.1f}",
-        f"{row.more_percent:+.1f}",
-        f"{row.x264_kbit:.1f}",
-        f"{row.against_x264_percent:+.1f}",
-    ]
-
-
-def write_robust_figure(result: Result, folder: Path, name: str = "loss_ssim") -> list[Path]:
+def write_robust_figure(result: Result, folder: Path, name: str) -> list[Path]:
     """Write figure and numbers: SSIM over loss with the 95 % intervals of several seeds, a line per
     method, a panel per round trip.
 
@@ -193,3 +148,13 @@ def write_robust_figure(result: Result, folder: Path, name: str = "loss_ssim") -
 def _interval(row: LossRow) -> Sequence[float]:
     """Return the 95 % interval of a mean; of one seed the value itself, twice."""
     return (row.ssim, row.ssim) if row.ssim_ci95 is None else row.ssim_ci95
+
+
+REPORT = Report(
+    "robust",
+    "Loss, wrong poses, another light",
+    "What a viewer sees over a link that loses datagrams, and what wrong poses, another lane and "
+    "another light cost in bits.",
+    robust_parts,
+    write_robust_figure,
+)

@@ -1,4 +1,4 @@
-"""Run the robustness experiment: loss, pose noise, light; drives and a field in, one file out.
+"""Run the robustness experiment: loss, pose noise and light.
 
 Loss: every method at some CRFs over the same link, with each of the seeds the same losses for all;
 what is compared is SSIM at one total rate, interpolated between CRFs, as the mean over the seeds
@@ -17,13 +17,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import groupby, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from lab.robust import EvalRobust
 from lab.robust.lossy_link import (
     Bursts,
     Crossing,
@@ -32,9 +32,8 @@ from lab.robust.lossy_link import (
     delta_crossing,
     x264_crossing,
 )
-from lab.robust.report import CrossingRow, DisturbanceRow, LossRow
+from lab.robust.report import CrossingRow, DisturbanceRow, LossRow, robust_parts
 from rfcore.camera import Camera, Pose
-from rfcore.codec.h264.config import check_effort
 from rfcore.codec.photometric import Photometric
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
@@ -42,17 +41,17 @@ from rfcore.image import I420
 from rfcore.localise.localiser import Localised, Localiser
 from rfcore.localise.prior import PosePrior
 from rfcore.motion import quaternion_from_vector
-from rfedge.evaluate.cells import CellStore, check_processes, each_done, program_version
 from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip, Drive, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.performance import perform
 from rfedge.evaluate.rivals import x264_lowdelay
-from rfedge.results import check_result_path, make_result, provenance, rows_of, write_result
+from rfedge.evaluate.runner import Run, program_version
+from rfedge.jobs import CellStore, Job, Tell
+from rfedge.results import rows_of
 
 __all__ = [
     "NOISES",
     "PoseNoise",
-    "RobustJob",
     "kbit_at",
     "kbit_between",
     "noisy_cameras",
@@ -142,52 +141,22 @@ SEED = 5
 RESAMPLED = 2000
 
 
-@dataclass(frozen=True)
-class RobustJob:
-    """What to disturb; see ``rfedge-lab robust --help``."""
-
-    field: Path
-    drive: str
-    dusk: str | None
-    lane: str | None
-    effort: str
-    preset: str
-    quality_db: float
-    frames: int
-    out: Path
-    cells: Path
-    quick: bool = False
-    seeds: int = 1
-    rtts_ms: Sequence[float] = (20.0, 50.0, 100.0)
-    processes: int = 1
-
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-        check_effort("effort", self.effort)
-        if self.frames < 4:
-            raise InvalidInput("frames", f"{self.frames} must be at least 4")
-        if not 1 <= self.seeds <= 10_000:
-            raise InvalidInput("seeds", f"{self.seeds} is outside 1..10,000")
-        check_processes(self.processes)
-        if not self.rtts_ms or not all(0 <= rtt_ms <= 10_000 for rtt_ms in self.rtts_ms):
-            raise InvalidInput("rtts_ms", f"{self.rtts_ms} must be some of 0..10,000 ms")
-
-
-def run_robust(job: RobustJob, console: Console) -> dict[str, Any]:
-    """Do what is not done yet, write ``job.out``, and return its content."""
-    made = provenance([job.field])
-    bench = _bench(job, console)
+def run_robust(job: EvalRobust, console: Console) -> dict[str, Any]:
+    """Do what is not done yet, write the result and print its rows."""
+    run = Run.begin("robust", job, [job.field], console)
+    bench = _bench(job, run.store, console)
     drive, field, count = bench.drive, bench.field, len(bench.drive.frames)
     scenarios = bench.scenarios()
     disturbances = 2 * len(bench.noises()) + 2
-    console.print(f"{len(scenarios)} crossings and {disturbances} disturbances of {count} frames")
-    if job.processes > 1:
-        for _ in each_done(partial(_cross, job), _of_a_seed(scenarios), job.processes):
-            pass
+    run.tell(f"{len(scenarios)} crossings and {disturbances} disturbances of {count} frames")
+    jobs = [
+        Job(f"crossings-{number}", partial(_cross, job, same))
+        for number, same in enumerate(_of_a_seed(scenarios), 1)
+    ]
+    run.parallel(jobs, job.processes)
     crossed = [bench.crossed(*scenario) for scenario in scenarios]
     disturbed = [*bench.pose_rows(), bench.lane_row(), *bench.light_rows()]
     content = {
-        "quick": job.quick,
         "seed": SEED,
         "field_id": field.field_id,
         "frames": {"drive": job.drive, "count": count, "sha256": drive.digest},
@@ -196,9 +165,7 @@ def run_robust(job: RobustJob, console: Console) -> dict[str, Any]:
         **_at_equal_rate(crossed),
         "disturbances": disturbed,
     }
-    result = make_result("robust", made, content)
-    write_result(job.out, result)
-    return result
+    return run.finish(content, robust_parts)
 
 
 Scenario = tuple[str, float, float, float, int]
@@ -206,35 +173,35 @@ Scenario = tuple[str, float, float, float, int]
 
 
 def _of_a_seed(scenarios: Sequence[Scenario]) -> list[list[Scenario]]:
-    """Return scenarios by coder and seed, what one process does at a time."""
+    """Return scenarios by coder and seed, which one job crosses."""
     return [
         list(same)
         for _, same in groupby(scenarios, lambda each: (each[0].startswith("x264"), *each[3:]))
     ]
 
 
-def _cross(job: RobustJob, scenarios: Sequence[Scenario]) -> None:
-    """Have the crossings' rows among the cells."""
+def _cross(job: EvalRobust, scenarios: Sequence[Scenario], _tell: Tell) -> None:
+    """Keep the rows of the crossings."""
     bench = _bench_of_process(job)
     for scenario in scenarios:
         bench.crossed(*scenario)
 
 
 @lru_cache(maxsize=1)
-def _bench_of_process(job: RobustJob) -> Bench:
-    return _bench(job, Console())
+def _bench_of_process(job: EvalRobust) -> Bench:
+    return _bench(job, CellStore(job.cells), Console())
 
 
-def _bench(job: RobustJob, console: Console) -> Bench:
+def _bench(job: EvalRobust, store: CellStore, console: Console) -> Bench:
     drive = read_drive(job.drive, QUICK_FRAMES if job.quick else job.frames)
-    return Bench(job, load_field(job.field), drive, CellStore(job.cells), console)
+    return Bench(job, load_field(job.field), drive, store, console)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What every part of the experiment needs."""
+    """A drive, a field and where finished pieces are kept, for every part of the experiment."""
 
-    job: RobustJob
+    job: EvalRobust
     field: RadianceField
     drive: Drive
     store: CellStore

@@ -1,50 +1,48 @@
-"""Cases and their bounds: the rows of ``rfedge-lab world`` and ``eval scale``, and their sections.
+"""The rows of ``rfedge-lab world`` and ``rfedge-lab scale``: cases and their bounds.
 
-Each group of cases of ``eval scale`` takes minutes, so that a run may measure some of them and keep
-the others' rows. Its result holds, next to the rows, which run each is of.
+Each group of cases of ``rfedge-lab scale`` takes minutes, so that a run may measure some of them
+and keep the others' rows. Its result holds, next to the rows, which run each is of.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.console import Console
-
 from lab.city.planned_load import PlannedRow
+from lab.report import Report, folded
 from rfcore.errors import InvalidInput
-from rfedge.report.tables import cell, heading, print_table, table
+from rfedge.report.tables import Table, columns, shown
 from rfedge.results import Provenance, Result, make_result, read_result, rows_of, write_result
 
 __all__ = [
+    "SCALE",
+    "WORLD",
     "Measured",
     "RayTiles",
     "ScaleRecord",
     "ScaleRow",
     "ScaleRun",
     "WorldRow",
-    "print_scale",
-    "print_world",
-    "scale_section",
-    "world_section",
+    "scale_parts",
+    "world_parts",
 ]
 
-SCALE = "scale"
-COLUMNS = ("case", "bound", "measured", "held")
+KIND = "scale"
 SAME_HOST = ("cpu", "cores")
-"""What of two hosts must agree for their rows to stand in one table."""
+"""Facts of two hosts that must agree for their rows to stand in one table."""
 
 
 @dataclass(frozen=True)
 class ScaleRow:
     """A case: what was measured, and the most it may be."""
 
-    case: str
-    bound: float
-    measured: float
-    held: bool
+    case: str = field(metadata=shown("case"))
+    bound: float = field(metadata=shown("bound"))
+    measured: float = field(metadata=shown("measured"))
+    held: bool = field(metadata=shown("held"))
 
     @staticmethod
     def at_most(case: str, bound: float, measured: float) -> ScaleRow:
@@ -58,9 +56,9 @@ class RayTiles:
 
     tiles: int
     list_sha256: str
-    """Of their ``tiles.json``, which names ground and pictures of each."""
+    """Digest of their ``tiles.json``, which names ground and pictures of each."""
     iterations: int
-    """Of each tile."""
+    """Iterations of each tile."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +67,11 @@ class Measured:
 
     rows: Sequence[ScaleRow]
     planning: Sequence[PlannedRow] = ()
-    """Figures of planned loads, of which ``rows`` has the differences."""
+    """Figures of planned loads; ``rows`` has their differences."""
     envoy_added_ms: Sequence[float] = ()
-    """Of each pair of runs, straight and through Envoy: the difference of the two p99."""
+    """Difference of the p99 through Envoy and straight, for each pair of runs."""
     ray: Sequence[RayTiles] = ()
-    """What the rows of Ray are of: one, or none."""
+    """The tiles that the rows of Ray are of: one, or none."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class ScaleRecord:
         """
         if not path.exists():
             return ScaleRecord()
-        result = read_result(path, SCALE)
+        result = read_result(path, KIND)
         _check_alike(path, result, made)
         return _record(result)
 
@@ -127,7 +125,7 @@ class ScaleRecord:
             "ray": self.ray,
             "runs": self.runs,
         }
-        write_result(path, make_result(SCALE, made, content))
+        write_result(path, make_result(KIND, made, content))
 
     def _runs_with(self, made: Provenance, cases: Sequence[str]) -> list[ScaleRun]:
         of_run: dict[tuple[str, str], list[str]] = {}
@@ -157,53 +155,50 @@ def _check_alike(path: Path, result: Result, made: Provenance) -> None:
         raise InvalidInput("add", f"{path} was measured with other inputs; name another file")
 
 
-def print_scale(console: Console, rows: Sequence[ScaleRow]) -> None:
-    """Print rows as a table."""
-    print_table(console, "", COLUMNS, [_scale_cells(row) for row in rows])
-
-
-def scale_section(path: Path, result: Result) -> str:
-    """Return the rows, of which run each is, and how far the pairs of runs of Envoy spread."""
+def scale_parts(result: Result) -> Iterator[Table | str]:
+    """Yield the rows, of which run each is, and how far the pairs of runs of Envoy spread."""
     record = _record(result)
-    parts = [
-        heading(path, result),
-        "Several servers (`docs/how-to/servers.md`). *Bound*: the most that is accepted. All "
-        "processes share the host.",
-        table(COLUMNS, [_scale_cells(row) for row in record.rows]),
-    ]
+    yield "*Bound*: the most that is accepted. All processes share the host."
+    yield Table("Several servers", columns(ScaleRow), record.rows)
     added_ms = record.envoy_added_ms
     if added_ms:
-        parts.append(
+        yield (
             f"Envoy added to the p99 in {len(added_ms)} pairs of runs: median "
             f"{statistics.median(added_ms):.2f} ms, {min(added_ms):.2f} to {max(added_ms):.2f} ms."
         )
-    parts += [
-        f"Ray: {of.tiles} tiles, {of.iterations} iterations each; the SHA-256 of their "
-        f"`tiles.json` is `{of.list_sha256}`."
-        for of in record.ray
-    ]
+    for of in record.ray:
+        yield (
+            f"Ray: {of.tiles} tiles, {of.iterations} iterations each; the SHA-256 of their "
+            f"`tiles.json` is `{of.list_sha256}`."
+        )
     runs = (f"* `{x.command}` at `{x.revision}`: {'; '.join(x.cases)}." for x in record.runs)
-    return "\n\n".join([*parts, "\n".join(runs), ""])
+    told = "\n".join(runs)
+    yield folded("Which run each row is of", told)
 
 
-def _scale_cells(row: ScaleRow) -> list[str]:
-    return [row.case, cell(row.bound), cell(row.measured), "yes" if row.held else "no"]
+SCALE = Report(
+    KIND,
+    "Several servers",
+    "What becomes of streams when servers behind Envoy are killed, drained and added, when NATS is "
+    "restarted, and of tiles that are trained on Ray.",
+    scale_parts,
+)
 
 
 @dataclass(frozen=True)
 class WorldRow:
     """A case of ``part``; ``held``: whether ``measured`` keeps ``bound``, None without a bound."""
 
-    part: str
-    case: str
-    bound: str
-    measured: str
-    held: bool | None
+    part: str = field(metadata=shown("part"))
+    case: str = field(metadata=shown("case"))
+    bound: str = field(metadata=shown("bound"))
+    measured: str = field(metadata=shown("measured"))
+    held: bool | None = field(metadata=shown("held"))
 
 
-def world_section(path: Path, result: Result) -> str:
-    """Return the table."""
-    notes = (
+def world_parts(result: Result) -> Iterator[Table | str]:
+    """Yield the rows, and the terms they use."""
+    yield (
         "Objects and views of the twin against the generator's truth, of pictures as a server "
         "decodes them. *Distance from the outline*: of every confirmed object to the nearest "
         "vehicle on the ground, however far that is. *Found*: by an object of its own within 2 m "
@@ -212,16 +207,14 @@ def world_section(path: Path, result: Result) -> str:
         "generator's evening, in the light that the field learnt from another pass. *Gain*: PSNR "
         "of a view less that of the field alone."
     )
-    cells = [_world_cells(row) for row in rows_of(WorldRow, result["rows"])]
-    return "\n\n".join([heading(path, result), notes, table(COLUMNS, cells), ""])
+    rows = rows_of(WorldRow, result["rows"])
+    yield Table("The twin against the truth", columns(WorldRow), rows)
 
 
-def print_world(console: Console, result: Result) -> None:
-    """Print the table."""
-    cells = [_world_cells(row) for row in rows_of(WorldRow, result["rows"])]
-    print_table(console, "The twin against the truth", COLUMNS, cells)
-
-
-def _world_cells(row: WorldRow) -> list[str]:
-    held = {True: "yes", False: "no", None: "-"}[row.held]
-    return [f"{row.part}: {row.case}", row.bound or "-", row.measured, held]
+WORLD = Report(
+    "world",
+    "The live twin against the truth",
+    "How well the twin finds objects, how close its live views come to the street, and what they "
+    "cost, against what the street generator knows.",
+    world_parts,
+)

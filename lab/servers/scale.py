@@ -28,7 +28,7 @@ from rich.console import Console
 
 from lab.city.check import CheckRow, largest_differences
 from lab.city.planned_load import PlannedLoad, PlannedRow, compare_with_plan
-from lab.servers.cases import Measured, ScaleRecord, ScaleRow, print_scale
+from lab.servers.cases import Measured, ScaleRecord, ScaleRow
 from lab.servers.envoy import (
     PROXIED,
     Envoy,
@@ -44,6 +44,7 @@ from rfcore.wire.twin_client import TwinClient
 from rfedge.datasets.convert import convert_dataset
 from rfedge.loadtest.run import TestBed
 from rfedge.processes import command_of
+from rfedge.report.tables import Table, columns
 from rfedge.results import provenance, read_result, rows_of
 from rfedge.samples import sample_path
 
@@ -154,7 +155,7 @@ def run_scale(job: ScaleJob, console: Console) -> None:
         rows += measured.rows
         record = record.plus(made, measured)
         record.write(job.out, made)
-    print_scale(console, rows)
+    Table("Several servers", columns(ScaleRow), rows).print(console)
     broken = [row.case for row in rows if not row.held]
     if broken:
         raise RfedgeError("not held: " + "; ".join(broken))

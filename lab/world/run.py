@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from lab.live.showing import TwinBed, ingest_latencies_ms
-from lab.servers.cases import WorldRow, print_world
+from lab.servers.cases import WorldRow, world_parts
 from lab.world import EvalWorld
 from lab.world.objects import AnnotatedPicture, dusk_rows, object_rows, received
 from lab.world.truth import Drive, SceneTruth, aside
@@ -37,6 +37,7 @@ from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S
 from rfedge.loadtest.prerecorded import PrerecordedDrive, Schedule, prerecorded_drive
 from rfedge.loadtest.vehicle import PrerecordedVehicle
 from rfedge.processes import command_of
+from rfedge.report.tables import Table
 from rfedge.results import (
     as_json,
     make_result,
@@ -82,7 +83,9 @@ def run_world(asked: EvalWorld) -> None:
         kept[name] = cases[name]()
         rows = [as_json(row) for part in cases for row in kept.get(part, [])]
         write_result(str(asked.out), make_result("world", source, {"rows": rows}))
-    print_world(console, read_result(asked.out))
+    for part in world_parts(read_result(asked.out)):
+        if isinstance(part, Table):
+            part.print(console)
 
 
 def _kept(out: Path, revision: str) -> dict[str, list[WorldRow]]:

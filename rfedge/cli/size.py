@@ -22,7 +22,8 @@ __all__ = ["Size"]
 class Size:
     """Estimate the uplink and the cores that cameras need with us, x264, x265 and SVT-AV1.
 
-    The estimate comes from tables measured on the sample street, or from your own drive and field.
+    The estimate comes from tables measured on the sample street (lab/results/sizing.md), or from
+    your own drive and field.
     """
 
     cameras: int = 1

@@ -1,6 +1,6 @@
-"""A codec's performance on a clip: coded at points that span a window of quality, and timed.
+"""A codec's performance on a clip, coded at points that span a window of quality, and timed.
 
-Everything is taken from a ``CellStore`` where it is there already.
+Everything is taken from a ``CellStore`` if it is there already.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.cells import CellKey, CellStore, Rows, clip_key
 from rfedge.evaluate.clips import STEADY, Clip, ClipCoder, CodedClip, psnr_of_mse
 from rfedge.evaluate.rate_curve import RateCurve, Window, rate_curve
+from rfedge.evaluate.runner import clip_key, coded_clip
+from rfedge.jobs import CellKey, CellStore, Rows
 
 __all__ = [
     "HEADLINE_DB",
@@ -29,7 +30,7 @@ __all__ = [
 ]
 
 HEADLINE_DB: Window = (32.0, 35.0)
-"""Luma PSNR over which BD-rates are quoted, unless a window is asked for."""
+"""Window of luma PSNR that BD-rates are quoted over unless another is asked for."""
 PROBE_FRAMES = 2
 TIMED_FRAMES, TIMED_REPEATS, ROUNDS = 12, 3, 5
 
@@ -45,7 +46,7 @@ class BoundedCoder(Protocol):
 
 @dataclass(frozen=True)
 class CpuTime:
-    """Processor time a frame: medians of several rounds, and the least and most that both ends
+    """Processor time a frame: medians over several rounds, and the least and most that both ends
     took together in one. ``receiver_ms`` is None for a method that does not tell."""
 
     sender_ms: float
@@ -55,7 +56,7 @@ class CpuTime:
 
     @property
     def both_ms(self) -> float:
-        """Of both ends, as far as they are known."""
+        """Time of both ends, as far as it is known."""
         return self.sender_ms + (self.receiver_ms or 0.0)
 
 
@@ -63,9 +64,9 @@ class CpuTime:
 class Performance:
     """A method's clips at all its operating points, and its sender's processor time a frame.
 
-    The time is that near the middle of the window asked about: it falls with the rate, and a mean
-    over all points would depend on how many of them are outside the window. ``cpu`` has more of it
-    where the method took turns with others (``time_in_turns``).
+    The time is taken near the middle of the window asked about: it falls with the rate, and a mean
+    over all points would depend on how many of them lie outside the window. ``cpu`` says more about
+    it if the method took turns with others (``time_in_turns``).
     """
 
     name: str
@@ -120,14 +121,14 @@ def perform(
     points = coder.points
     if window_db is not None:
         points = spanning_points(clip, coder, store, window_db)
-    clips = tuple(_coded(clip, coder, point, store) for point in points)
+    clips = tuple(coded_clip(clip, coder, point, store) for point in points)
     performance = Performance(coder.name, clips, float("inf"))
     if not timed:
         return performance
     point = performance.nearest(sum(window_db or HEADLINE_DB) / 2).point
     key = {**clip_key(clip, coder, point), "timed": TIMED_REPEATS}
     if retime:
-        store.forget(key)
+        store.cell(key).forget()
     (row,) = store.rows(key, lambda: _timed(clip, coder, point))
     return replace(performance, cpu_ms_per_frame=float(row["cpu_ms_per_frame"]))
 
@@ -146,7 +147,7 @@ def spanning_points(
     points = list(coder.points)
 
     def coded(point: float) -> CodedClip:
-        return _coded(clip, coder, point, store)
+        return coded_clip(clip, coder, point, store)
 
     while _frame_psnr_db(coded(points[0])).min() < high_db:
         better = _beyond(coder, points[1], points[0])
@@ -182,11 +183,6 @@ def _beyond(coder: ClipCoder, inner: float, end: float) -> float | None:
     return None if further == end else further
 
 
-def _coded(clip: Clip, coder: ClipCoder, point: float, store: CellStore) -> CodedClip:
-    key = clip_key(clip, coder, point)
-    return store.clip(key, lambda: coder.code(clip.frames, clip.rate_hz, point))
-
-
 def _timed(clip: Clip, coder: ClipCoder, point: float) -> Rows:
     """Return the least of a few runs over the beginning of the clip: others only add to it."""
     frames = clip.frames[:TIMED_FRAMES]
@@ -216,7 +212,7 @@ def time_in_turns(
         "coders": "; ".join(f"{n} {c.version} at {p:g}" for n, (c, p) in tasks.items()),
     }
     if retime:
-        store.forget(key)
+        store.cell(key).forget()
     rows = store.rows(key, lambda: _rounds(clip, tasks))
     times = {str(row.pop("name")): CpuTime(**row) for row in rows}
     return [

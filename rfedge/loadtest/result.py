@@ -21,7 +21,7 @@ from rfcore.files import write_whole
 from rfedge.loadtest.plan import Load, Mode, Vehicles
 from rfedge.loadtest.run import Run, TestBed, run_load
 from rfedge.report.charts import RENDER, STYLE, new_axes, svg
-from rfedge.report.tables import print_table
+from rfedge.report.tables import text_table
 from rfedge.results import make_result, provenance, write_result
 
 __all__ = [
@@ -126,7 +126,7 @@ def print_runs(console: Console, result: LoadResult) -> None:
         ]
         for run in result.runs
     ]
-    print_table(console, result.headline(), columns, rows)
+    text_table(columns, rows, result.headline()).print(console)
 
 
 def write_load_result(result: LoadResult, out: Path) -> None:

@@ -21,10 +21,11 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.evaluate.cells import CellStore, clip_key, program_version
 from rfedge.evaluate.clips import STEADY, Clip, CodedClip, Drive, DriveName, psnr_of_mse
 from rfedge.evaluate.field_coder import FieldCoder, RenderedClip, render_clip
 from rfedge.evaluate.rivals import Rival, svtav1_lowdelay, x264_for_psnr, x265_for_psnr
+from rfedge.evaluate.runner import clip_key, coded_clip, program_version
+from rfedge.jobs import CellStore
 from rfedge.offline import FrameInput, decode_promised, encode_frames
 from rfedge.sizing.estimate import Demand
 from rfedge.sizing.tables import SizingCell, SizingTables, interpolated
@@ -79,7 +80,7 @@ def measured_cells(drive: Drive, field: RadianceField, store: CellStore) -> Iter
 def _measured(
     codec: str, coder: FieldCoder | Rival, clip: Clip, rendered: RenderedClip, store: CellStore
 ) -> SizingCell:
-    clips = [_coded(clip, coder, point, store) for point in coder.points]
+    clips = [coded_clip(clip, coder, point, store) for point in coder.points]
     steady = steady_frames(len(clip.frames))
     nearest = min(clips, key=lambda coded: abs(coded.psnr_db(steady) - MIDDLE_DB))
 
@@ -97,11 +98,6 @@ def _measured(
 def steady_frames(count: int) -> slice:
     """Return which frames of a clip of ``count`` stand for its steady state."""
     return SETTLING if count >= SETTLED_FRAMES else STEADY
-
-
-def _coded(clip: Clip, coder: FieldCoder | Rival, point: float, store: CellStore) -> CodedClip:
-    key = clip_key(clip, coder, point)
-    return store.clip(key, lambda: coder.code(clip.frames, clip.rate_hz, point))
 
 
 def _our_receiver_ms(rendered: RenderedClip, frames: Sequence[I420], crf: float) -> float:

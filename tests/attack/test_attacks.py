@@ -20,7 +20,7 @@ from mec_server.decoding.child import DECODER_NAME
 
 NEWCOMER_S = 2.0
 """A SYN that is lost is sent again after 1 s (RFC 6298, section 2), and a vehicle that comes back
-to a server at rest has a picture shown within 1 s (F1 of docs/reliability.md)."""
+to a server at rest has a picture shown within 1 s (F1 of lab/results/faults.md)."""
 
 
 @pytest.mark.parametrize("attack", ATTACKS)

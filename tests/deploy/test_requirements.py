@@ -43,7 +43,7 @@ def test_the_demo_needs_no_extra_but_the_page_that_it_points_to() -> None:
 
 
 def test_only_the_workbench_needs_what_renders_streets_drives_browsers_and_builds_itself() -> None:
-    workbench = {"mitsuba", "selenium", "libsumo", "hatchling", "editables"}
+    workbench = {"mitsuba", "selenium", "hatchling", "editables"}
     assert workbench <= set(wanted("test"))
     for name in ("runtime", "full", "demo"):
         assert not workbench & set(wanted(name))

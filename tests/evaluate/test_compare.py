@@ -7,10 +7,9 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.cells import CellStore
 from rfedge.evaluate.clips import Clip, CodedClip
 from rfedge.evaluate.compare.measure import SSIM_WINDOW, compare_rows, ssim_rows
-from rfedge.evaluate.compare.report import BEST, BEST_OF_ANY_CPU
+from rfedge.evaluate.compare.rows import BEST, BEST_OF_ANY_CPU
 from rfedge.evaluate.performance import (
     ROUNDS,
     TIMED_REPEATS,
@@ -19,6 +18,7 @@ from rfedge.evaluate.performance import (
     perform,
     time_in_turns,
 )
+from rfedge.jobs import CellStore
 
 PLANE = np.zeros((2, 2), np.uint8)
 CLIP = Clip("street", 10.0, [I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])], "digest", 27.5)

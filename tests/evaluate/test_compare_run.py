@@ -15,12 +15,13 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
+from rfedge.evaluate import runner
 from rfedge.evaluate.clips import DriveName, read_drive
 from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.compare import run as compare_run
-from rfedge.evaluate.compare.drives import CompareJob, foreign_coder, read_drive_comparisons
+from rfedge.evaluate.compare.drives import foreign_coder, jobs_of_drives, read_drive_comparisons
 from rfedge.evaluate.compare.measure import BEST, BEST_OF_ANY_CPU
-from rfedge.evaluate.compare.run import code_on_ray, run_compare
+from rfedge.evaluate.compare.run import run_compare
 from rfedge.evaluate.rivals import x264_lowdelay
 from rfedge.jobs import run_jobs
 
@@ -114,17 +115,9 @@ def test_a_module_that_lacks_something_itself_is_told_from_one_that_is_not_there
 
 
 @pytest.mark.parametrize("window", [(35.0, 32.0), (32.0, 32.0), (0.0, 30.0), (30.0, math.inf)])
-def test_a_window_that_does_not_rise_is_refused(tmp_path, window):
+def test_a_window_that_does_not_rise_is_refused(window):
     with pytest.raises(InvalidInput, match="window"):
-        CompareJob(
-            Path("f.rff"),
-            ("a@1=b",),
-            "fast",
-            "veryfast",
-            tmp_path / "c.json",
-            tmp_path,
-            window_db=window,
-        )
+        EvalCompare(field=Path("f.rff"), drives=("a@1=b",), window=window)
 
 
 def job_of(thumbnail, folder, **change):
@@ -137,14 +130,14 @@ def job_of(thumbnail, folder, **change):
         "cells": folder / "cells",
         "quick": True,
     }
-    return CompareJob(**given | change)
+    return EvalCompare(**given | change)
 
 
 @pytest.fixture(scope="module")
 def compared(thumbnail, tmp_path_factory):
     """A comparison over a window that our own points do not reach down to, with a background."""
     folder = tmp_path_factory.mktemp("compared")
-    job = job_of(thumbnail, folder, window_db=(33.0, 36.0), backgrounds=(thumbnail.empty,))
+    job = job_of(thumbnail, folder, window=(33.0, 36.0), background=(thumbnail.empty,))
     console = Console(record=True, quiet=False, file=io.StringIO(), width=200)
     return job, run_compare(job, console), console.export_text()
 
@@ -201,21 +194,20 @@ def test_jobs_leave_all_cells_that_a_comparison_looks_for(
     compared, thumbnail, tmp_path, monkeypatch
 ):
     here, result, _ = compared
-    addresses = []
+    addresses, cells = [], {}
 
-    def on_workers(jobs, tell, address):
+    def on_workers(jobs, tell, address, _processes):
         addresses.append(address)
-        return run_jobs(pickle.loads(pickle.dumps(jobs)), tell)
+        done = run_jobs(pickle.loads(pickle.dumps(jobs)), tell)
+        cells.update({path.name: path.read_bytes() for path in job.cells.iterdir()})
+        return done
 
-    monkeypatch.setattr(compare_run, "run_jobs", on_workers)
-    job = job_of(thumbnail, tmp_path, window_db=here.window_db, backgrounds=here.backgrounds)
-    lines = []
-    code_on_ray(job, "10.0.0.1:6379", lines.append)
-    assert addresses == ["10.0.0.1:6379"]
-    assert sum(line.endswith(": done") for line in lines) == compare_run.PARTS
-    cells = {path.name: path.read_bytes() for path in job.cells.iterdir()}
-    assert len(cells) >= 75
+    monkeypatch.setattr(runner, "run_jobs", on_workers)
+    same = {"window": here.window, "background": here.background}
+    job = job_of(thumbnail, tmp_path, ray="10.0.0.1:6379", **same)
     again = run_compare(job, Console(quiet=True))
+    assert addresses == ["10.0.0.1:6379"]
+    assert len(cells) >= 75
     after = {path.name: path.read_bytes() for path in job.cells.iterdir()}
     assert {name: after[name] for name in cells} == cells
     assert len(after) == len(cells) + 2, "processor times, and whose bits they are"
@@ -226,7 +218,7 @@ def test_jobs_leave_all_cells_that_a_comparison_looks_for(
 
 @pytest.mark.slow
 def test_processes_give_the_rows_that_one_gives(thumbnail, tmp_path):
-    only = {"rivals": ("x264-lowdelay",), "window_db": (33.0, 36.0)}
+    only = {"rivals": ("x264-lowdelay",), "window": (33.0, 36.0)}
     alone = job_of(thumbnail, tmp_path, **only)
     shared = replace(alone, cells=tmp_path / "shared", processes=2)
     one, two = (run_compare(job, Console(quiet=True)) for job in (alone, shared))
@@ -240,18 +232,14 @@ def test_processes_that_cannot_be_are_refused(thumbnail, tmp_path):
         job_of(thumbnail, tmp_path, processes=0)
 
 
-def test_each_drive_of_a_comparison_keeps_its_background(tmp_path):
-    job = CompareJob(
+def test_each_drive_of_a_comparison_keeps_its_background():
+    job = EvalCompare(
         field=Path("wall.rff"),
         drives=("a@10=a.json", "b@5=b.json,own.rff"),
         decimated=("c@30=c.json",),
-        backgrounds=("b@5=nothing.json",),
-        effort="fast",
-        preset="veryfast",
-        out=tmp_path / "compare.json",
-        cells=tmp_path,
+        background=("b@5=nothing.json",),
     )
-    apart = [(one.drives, one.decimated, one.backgrounds) for one in job.of_each_drive()]
+    apart = [(one.drives, one.decimated, one.background) for one in jobs_of_drives(job)]
     assert apart == [
         (("a@10=a.json",), (), ()),
         (("b@5=b.json,own.rff",), (), ("b@5=nothing.json",)),
@@ -260,7 +248,7 @@ def test_each_drive_of_a_comparison_keeps_its_background(tmp_path):
 
 
 def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbnail, tmp_path):
-    job = job_of(thumbnail, tmp_path, window_db=(15.0, 18.0))
+    job = job_of(thumbnail, tmp_path, window=(15.0, 18.0))
     with pytest.raises(InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-fast.* reaches"):
         run_compare(job, Console(quiet=True))
     assert len(list(job.cells.iterdir())) <= 8, "our own ends alone were coded"
@@ -277,20 +265,18 @@ def test_the_command_takes_a_window(tmp_path, monkeypatch, options, window):
     monkeypatch.setattr(compare_run, "run_compare", lambda job, _console: jobs.append(job))
     command = tyro.cli(EvalCompare, args=["wall.rff", "wall@10=drive.json", *options])
     command.run()
-    assert [job.window_db for job in jobs] == [window]
-    assert jobs[0].windows_db[0] == (window or (32.0, 35.0))
+    assert [job.window for job in jobs] == [window]
 
 
 def test_a_background_without_its_drive_is_refused(thumbnail, tmp_path):
     elsewhere = thumbnail.empty.replace("wall@10", "alley@10")
     with pytest.raises(InvalidInput, match="alley"):
-        run_compare(job_of(thumbnail, tmp_path, backgrounds=(elsewhere,)), Console(quiet=True))
+        run_compare(job_of(thumbnail, tmp_path, background=(elsewhere,)), Console(quiet=True))
 
 
 def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path):
-    job = CompareJob(
+    job = EvalCompare(
         field=SAMPLES / "fields" / "street.rff",
-        drives=(),
         decimated=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
         effort="fast",
         preset="veryfast",
@@ -317,15 +303,15 @@ def test_a_drive_may_name_a_field_of_its_own(thumbnail, tmp_path):
     assert other.field_bytes == own.stat().st_size
 
 
-def test_a_comparison_of_nothing_is_refused(tmp_path):
+def test_a_comparison_of_nothing_is_refused():
     with pytest.raises(InvalidInput, match="there is none"):
-        CompareJob(Path("field.rff"), (), "fast", "veryfast", tmp_path / "compare.json", tmp_path)
+        EvalCompare(field=Path("field.rff"))
 
 
 def test_rivals_that_are_asked_for_stand_alone_with_the_one_a_field_is_paid_for_against(
     thumbnail, tmp_path
 ):
-    job = job_of(thumbnail, tmp_path, window_db=(33.0, 36.0), rivals=("x264-our-tools-ultrafast",))
+    job = job_of(thumbnail, tmp_path, window=(33.0, 36.0), rivals=("x264-our-tools-ultrafast",))
     result = run_compare(job, Console(quiet=True))
     assert {row["rival"] for row in result["rows"]} - {BEST, BEST_OF_ANY_CPU} == {
         "x264-our-tools-ultrafast",
@@ -336,22 +322,23 @@ def test_rivals_that_are_asked_for_stand_alone_with_the_one_a_field_is_paid_for_
 
 
 def test_a_rival_that_nobody_knows_is_refused_with_those_there_are(thumbnail, tmp_path):
+    job = job_of(thumbnail, tmp_path, rivals=("h264",))
     with pytest.raises(InvalidInput, match="rivals: 'h264' is none of x264-lowdelay, x264-lowd"):
-        job_of(thumbnail, tmp_path, rivals=("h264",))
+        run_compare(job, Console(quiet=True))
 
 
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_quick_comparison_writes_rows_and_goes_on_from_its_cells(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "users_module", sys.modules[__name__])
-    job = CompareJob(
+    job = EvalCompare(
         field=SAMPLES / "fields" / "street.rff",
         drives=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
         effort="fast",
         preset="veryfast",
         out=tmp_path / "compare.json",
         cells=tmp_path / "cells",
-        methods=("users_module:UsersCodec",),
+        method=("users_module:UsersCodec",),
         quick=True,
     )
     first = run_compare(job, Console(quiet=True))

@@ -14,6 +14,7 @@ from rfedge.evaluate.compare.foreground import (
     foreground_row,
 )
 from rfedge.evaluate.performance import perform
+from rfedge.jobs import CellStore
 
 SIZE = (96, 64)
 CHROMA = np.full((SIZE[1] // 2, SIZE[0] // 2), 128, np.uint8)
@@ -32,14 +33,6 @@ def with_object(seed):
 
 FRAMES = [with_object(seed) for seed in range(3)]
 MASKS = [foreground_mask(frame, STREET) for frame in FRAMES]
-
-
-class NoStore:
-    def clip(self, _key, make):
-        return make()
-
-    def rows(self, _key, make):
-        return make()
 
 
 def test_the_mask_is_the_object():
@@ -62,10 +55,10 @@ def test_no_rate_lifts_the_whole_picture_above_its_background():
     assert max(best.notes["foreground_sse"]) < MASKS[0].sum()
 
 
-def test_against_itself_the_foreground_costs_the_same_and_the_ceiling_is_said():
+def test_against_itself_the_foreground_costs_the_same_and_the_ceiling_is_said(tmp_path):
     coder = ForegroundCoder.of("veryfast", MASKS, [RENDER] * 3, "test")
     clip = Clip("street", 10.0, FRAMES, "digest", None)
-    clips = perform(clip, coder, NoStore()).clips
+    clips = perform(clip, coder, CellStore(tmp_path)).clips
     row = foreground_row(clip, clips, clips, MASKS)
     assert row.bd_rate_percent == pytest.approx(0)
     assert row.whole_picture_ceiling_db == pytest.approx(
@@ -73,10 +66,10 @@ def test_against_itself_the_foreground_costs_the_same_and_the_ceiling_is_said():
     )
 
 
-def test_a_drive_without_foreground_is_refused():
+def test_a_drive_without_foreground_is_refused(tmp_path):
     coder = ForegroundCoder.of("veryfast", MASKS, [RENDER] * 3, "test")
     clip = Clip("street", 10.0, FRAMES, "digest", None)
-    clips = perform(clip, coder, NoStore()).clips
+    clips = perform(clip, coder, CellStore(tmp_path)).clips
     with pytest.raises(InvalidInput, match="no frame differs"):
         foreground_row(clip, clips, clips, [np.zeros_like(MASKS[0])] * 3)
 

@@ -12,10 +12,10 @@ from rfcore.errors import InvalidInput
 from rfcore.field import Quality, load_field
 from rfedge.evaluate.clips import read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
-from rfedge.evaluate.ladder import run
+from rfedge.evaluate.ladder import EvalLadder, run
 from rfedge.evaluate.ladder.measure import measure_rung, time_renders
-from rfedge.evaluate.ladder.page import ladder_page, write_ladder_figure
-from rfedge.evaluate.ladder.run import LadderJob, fronts, rate_percents, run_ladder, rungs_for
+from rfedge.evaluate.ladder.rows import ladder_parts, write_ladder_figure
+from rfedge.evaluate.ladder.run import fronts, rate_percents, run_ladder, rungs_for
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {
@@ -71,11 +71,10 @@ def test_every_rung_is_measured_once_and_the_full_one_first(kind, quick):
 def test_a_ladder_is_measured_written_drawn_and_read_by_an_agent(tmp_path, monkeypatch):
     rungs = [Rung(effort="fast"), Rung(Quality(0.1), 0, effort="fast")]
     monkeypatch.setattr(run, "rungs_for", lambda _kind, **_: rungs)
-    job = LadderJob(
-        [SAMPLES / "fields/street.rff"],
-        SAMPLES / "street/transforms_drive_empty.json",
-        tmp_path / "ladder.json",
-        tmp_path / "cells",
+    job = EvalLadder(
+        drive=SAMPLES / "street/transforms_drive_empty.json",
+        out=tmp_path / "ladder.json",
+        cells=tmp_path / "cells",
         frames=3,
     )
     console = Console(record=True)
@@ -99,13 +98,11 @@ def test_a_ladder_is_measured_written_drawn_and_read_by_an_agent(tmp_path, monke
     assert all(r.sender_ms > min(row["sender_ms"] for row in result["rows"]) for r in planned)
     monkeypatch.setattr(run, "measure_rung", lambda *_: pytest.fail("measured again"))
     assert run_ladder(job, Console(quiet=True)) == result
-    svg, numbers = write_ladder_figure(result, tmp_path / "figures")
+    svg, numbers = write_ladder_figure(result, tmp_path / "figures", "ladder")
     assert svg.read_text().startswith("<?xml")
     assert len(numbers.read_text().splitlines()) == 3
-    page = ladder_page(result, {"run": {"curve": [[25, 26.0], [300, 28.97]]}})
-    assert "| splats 10% render-only fast crf28 | yes |" in page
-    assert "| run | 300 | 28.97 |" in page
-    assert "| splats 100% | half |" in page
+    texts = [p if isinstance(p, str) else p.markdown() for p in ladder_parts(result)]
+    assert any("| splats 10% render-only fast crf28 |" in text for text in texts)
 
 
 @pytest.fixture(scope="module")
@@ -165,15 +162,8 @@ def test_a_quick_ladder_is_a_part_of_the_whole():
 
 @pytest.mark.parametrize(
     ("change", "named"),
-    [({"fields": []}, "fields"), ({"out": Path("x")}, "out"), ({"frames": 2}, "frames")],
+    [({"fields": ()}, "fields"), ({"out": Path("x")}, "out"), ({"frames": 2}, "frames")],
 )
 def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
-    given = {
-        "fields": [Path("a")],
-        "drive": Path("b"),
-        "out": Path("c.json"),
-        "cells": Path("d"),
-        "frames": 24,
-    }
     with pytest.raises(InvalidInput, match=named):
-        LadderJob(**(given | change))
+        EvalLadder(**change)

@@ -14,15 +14,15 @@ from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_colour
 from rfcore.raster.gaussians import Gaussians
 from rfcore.views import PosedPicture
-from rfedge.evaluate.cells import CellStore
 from rfedge.evaluate.clips import Drive, DriveName
+from rfedge.evaluate.never_worse import EvalNeverWorse
 from rfedge.evaluate.never_worse.measure import (
     CONTROLS,
     NeverWorse,
-    NeverWorseJob,
     controls_of,
     run_never_worse,
 )
+from rfedge.jobs import CellStore
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 INTRINSICS = Intrinsics(160, 96, 120.0, 120.0, 80.0, 48.0)
@@ -107,16 +107,15 @@ def test_a_row_tells_excess_without_header_and_whether_it_holds(tmp_path, seen):
 
 def test_a_job_without_drives_is_refused():
     with pytest.raises(InvalidInput, match="drives"):
-        NeverWorseJob(Path("f.rff"), (), (), "fast", "veryfast", Path("o.json"), Path("cells"))
+        EvalNeverWorse(field=Path("f.rff"))
 
 
 @pytest.fixture(scope="module")
 def on_the_thumbnail(thumbnail, tmp_path_factory):
     folder = tmp_path_factory.mktemp("never-worse")
-    job = NeverWorseJob(
+    job = EvalNeverWorse(
         field=thumbnail.field,
         drives=(thumbnail.drive,),
-        decimated=(),
         effort="fast",
         preset="ultrafast",
         out=folder / "never.json",
@@ -161,10 +160,9 @@ def test_a_run_that_is_finished_is_taken_from_its_cells(on_the_thumbnail):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_on_the_sample_no_field_makes_it_worse(tmp_path):
-    job = NeverWorseJob(
+    job = EvalNeverWorse(
         field=SAMPLES / "fields" / "street.rff",
         drives=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
-        decimated=(),
         effort="fast",
         preset="veryfast",
         out=tmp_path / "never.json",

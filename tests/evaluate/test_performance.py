@@ -7,7 +7,6 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.cells import CellStore, clip_key
 from rfedge.evaluate.clips import Clip, CodedClip
 from rfedge.evaluate.performance import (
     TIMED_FRAMES,
@@ -19,6 +18,8 @@ from rfedge.evaluate.performance import (
     spanning_points,
     time_in_turns,
 )
+from rfedge.evaluate.runner import clip_key
+from rfedge.jobs import CellStore
 
 PLANE = np.zeros((2, 2), np.uint8)
 FRAME = I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])

@@ -8,7 +8,7 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
 from rfcore.views import FieldView
-from rfedge.evaluate.compare.run import KINDS, SplitClip, macroblock_kinds, split_rows
+from rfedge.evaluate.compare.bits import KINDS, SplitClip, macroblock_kinds, split_rows
 from rfedge.evaluate.field_coder import FieldCoder, RenderedClip
 
 SIZE = (96, 64)

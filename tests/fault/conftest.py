@@ -5,7 +5,7 @@ The street, its coded frames and the raw vehicle are those of ``tests/integratio
 a server what it does on a road; bystanders replay packets there that were coded beforehand, as a
 vehicle renders and codes on a machine of its own. Time is part of what is tested here: bounds are
 in seconds of this machine, so run it on one that is quiet (``make test-fault``; it writes
-``lab/results/faults.json``, and ``docs/reliability.md`` from it).
+``lab/results/faults.json``, and ``lab/results/faults.md`` from it).
 """
 
 import asyncio
@@ -36,7 +36,7 @@ from integration.conftest import (
     raw_vehicle,
     small_street,
 )
-from lab.pages.faults import LinkCell
+from lab.pages.suites import LinkCell
 from machine import MEASURED_AGAIN
 from mec_server.decoding.child import DECODER_NAME
 from rfcore.codec.h264.config import CodecConfig
@@ -302,7 +302,7 @@ class Case(Figures):
     _fault_until_s: float = 0.0
 
     def about(self, fault: str, injected_with: str, covers: str) -> None:
-        """Say what is done, with what, and which of ``lab.pages.faults.KINDS`` it is."""
+        """Say what is done, with what, and which of ``lab.pages.suites.KINDS`` it is."""
         size = f", {SHIPPED}" if isinstance(self.street, ShippedStreet) else ""
         self.fault, self.injected_with, self.covers = f"{fault}{size}", injected_with, covers
 

@@ -24,7 +24,7 @@ import pytest
 
 from attack.conftest import ENVIRONMENT, ROOT
 from fault.conftest import is_exact
-from lab.pages.faults import LinkCell
+from lab.pages.suites import LinkCell
 from rfcore.dataset import read_dataset
 from rfcore.dataset.recorded_session import read_recorded_part, recordings_under
 from rfcore.field import FieldStore

@@ -1,7 +1,7 @@
-"""The hard cases' result file and page, written by the very run that checks the cases.
+"""The hard cases' result file, written by the very run that checks the cases.
 
-``make stability`` runs them with ``--stability-json`` and ``--stability-page``; without these
-options (``pytest -m hard``) nothing is written.
+``make stability`` runs them with ``--stability-json``; without it (``pytest -m hard``) nothing is
+written.
 """
 
 from collections.abc import Callable
@@ -11,8 +11,7 @@ import pytest
 
 from hard.cases import CASES
 from hard.cases.case import Case, Finding
-from hard.cases.page import Row, case_row, stability_page, stability_result, unmeasured
-from rfcore.files import write_whole
+from hard.cases.page import Row, case_row, stability_result, unmeasured
 from rfedge.results import write_result
 
 ROWS = pytest.StashKey[list[Row]]()
@@ -20,7 +19,6 @@ ROWS = pytest.StashKey[list[Row]]()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--stability-json", type=Path, help="write what came of every hard case here")
-    parser.addoption("--stability-page", type=Path, help="write the page made of it here")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -39,18 +37,13 @@ def record_finding(pytestconfig: pytest.Config) -> Callable[[Case, Finding], Non
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     json_path = session.config.getoption("--stability-json")
-    page_path = session.config.getoption("--stability-page")
-    if json_path is None and page_path is None:
+    if json_path is None:
         return
     rows = session.config.stash[ROWS]
     missing = unmeasured(CASES, rows)
-    if missing:  # a page of some cases would look like one of all
+    if missing:  # a result of some cases would look like one of all
         raise pytest.UsageError(
             f"{len(missing)} of {len(CASES)} hard cases gave no finding, such as {missing[0]!r}; "
             "nothing was written: run `make stability`"
         )
-    result = stability_result(rows)
-    if json_path is not None:
-        write_result(json_path, result)
-    if page_path is not None:
-        write_whole(page_path, stability_page(result).rstrip() + "\n")
+    write_result(json_path, stability_result(rows))

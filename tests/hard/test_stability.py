@@ -1,4 +1,4 @@
-"""Every hard case holds, and the committed page is what came of them."""
+"""Every hard case holds, and the recorded result is what came of them."""
 
 import json
 from collections.abc import Callable
@@ -8,14 +8,13 @@ import pytest
 
 from hard.cases import CASES
 from hard.cases.case import Case, Finding, refusal, statement, within
-from hard.cases.page import case_row, stability_page, stability_result, unmeasured
+from hard.cases.page import case_row, unmeasured
 from rfcore.errors import InvalidInput
 
 pytestmark = pytest.mark.hard
 
 ROOT = Path(__file__).parents[2]
-RESULT = ROOT / "results" / "stability.json"
-PAGE = ROOT / "docs" / "stability.md"
+RESULT = ROOT / "lab" / "results" / "stability.json"
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.group}-{case.name}")
@@ -25,16 +24,9 @@ def test_the_case_holds(case: Case, record_finding: Callable[[Case, Finding], No
     assert finding.holds, f"expected {case.expected}, got {finding}"
 
 
-def test_there_are_enough_cases_of_every_kind_and_no_two_alike() -> None:
+def test_no_two_cases_are_alike() -> None:
     names = [(case.group, case.name) for case in CASES]
-    assert len(set(names)) == len(names) >= 60
-    groups = {group for group, _ in names}
-    assert groups >= {"Gaussians", "Training", "Poses", "Pictures and metrics", "Delta codec"}
-
-
-def test_the_page_is_generated_from_the_result_file() -> None:
-    result = json.loads(RESULT.read_text())
-    assert PAGE.read_text().rstrip() == stability_page(result).rstrip(), "run `make stability`"
+    assert len(set(names)) == len(names)
 
 
 def test_the_result_file_has_exactly_these_cases_and_all_hold() -> None:
@@ -42,13 +34,6 @@ def test_the_result_file_has_exactly_these_cases_and_all_hold() -> None:
     listed = [(row["group"], row["name"], row["expected"]) for row in rows]
     assert listed == [(c.group, c.name, c.expected) for c in CASES], "run `make stability`"
     assert [row["name"] for row in rows if not row["holds"]] == []
-
-
-def test_a_case_that_breaks_is_named_on_the_page() -> None:
-    broken = Case("Poses", "a lie", "truth", lambda: within(2.0, 1.0))
-    page = stability_page(stability_result([case_row(broken, broken.measure())]))
-    assert "Broken: Poses: a lie." in page
-    assert "| a lie | truth | as expected | 2.0e+00 | 1.0e+00 |" in page
 
 
 def test_a_case_that_gave_no_finding_is_missed_by_name() -> None:

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from lab.adapt import EvalAdapt
 from lab.adapt.measure import (
     FIRST,
     AdaptCase,
-    AdaptJob,
     AdaptRow,
-    adapt_section,
     drives_to_break_even,
     kbit_at,
     messages_differ,
@@ -31,7 +30,6 @@ from rfcore.image import I420
 from rfedge.evaluate.clips import CodedClip, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.performance import Performance
-from rfedge.results import Provenance, make_result
 from rfedge.samples import sample_path
 
 
@@ -156,7 +154,7 @@ def test_a_case_names_its_drive_fields_and_variants() -> None:
         10,
         Path("d.json"),
     )
-    assert (case.field, case.noon) == (Path("f.rff"), Path("n.json"))
+    assert (case.own, case.noon) == (Path("f.rff"), Path("n.json"))
     assert case.variants == {"learnt": Path("g.rff"), "layer": Path("l.rff")}
     assert AdaptCase.parse("a@5=d,field=f").noon is None
     taught = AdaptCase.parse("a@5=d,field=f,learnt:3=g.rff,layer=l.rff")
@@ -188,7 +186,18 @@ def test_a_case_of_another_form_is_refused(text: str, said: str) -> None:
 
 def test_a_job_without_cases_is_refused() -> None:
     with pytest.raises(InvalidInput, match="cases"):
-        AdaptJob((), "fast", "ultrafast", Path("o.json"), Path("cells"))
+        EvalAdapt(cases=())
+
+
+def job_of(text: str, folder: Path) -> EvalAdapt:
+    return EvalAdapt(
+        cases=(text,),
+        effort="fast",
+        preset="ultrafast",
+        out=folder / "a.json",
+        cells=folder / "cells",
+        quick=True,
+    )
 
 
 def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
@@ -197,9 +206,7 @@ def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
     """Another name for the same field changes no bit; at noon a tool that is not used neither."""
     text = f"{thumbnail.drive},field={thumbnail.field},again:2/1={thumbnail.field}"
     text += f",noon={thumbnail.drive.partition('=')[2]}"
-    job = AdaptJob(
-        (AdaptCase.parse(text),), "fast", "ultrafast", tmp_path / "a.json", tmp_path / "cells", True
-    )
+    job = job_of(text, tmp_path)
     result = run_adapt(job, Console(file=io.StringIO(), width=200))
     rows = {row["variant"]: row for row in result["rows"]}
     assert list(rows) == ["off", "matrix", "auto", "again"]
@@ -232,9 +239,7 @@ def test_where_a_field_shows_33_db_before_a_bit_is_sent_no_bits_are_stated(
 ) -> None:
     text = f"{thumbnail.empty},field={thumbnail.field},again={thumbnail.field}"
     text += f",empty={thumbnail.empty.partition('=')[2]}"
-    job = AdaptJob(
-        (AdaptCase.parse(text),), "fast", "ultrafast", tmp_path / "a.json", tmp_path / "cells", True
-    )
+    job = job_of(text, tmp_path)
     said = io.StringIO()
     off, _, _, again = run_adapt(job, Console(file=said, width=200))["rows"]
     assert off["kbit_33db"] is None
@@ -262,30 +267,7 @@ ROW = AdaptRow(
 )
 
 
-HOST = {"cpu": "A CPU", "cores": 2, "isa": "avx2"}
-MADE = Provenance("rfedge-lab adapt", "abc123", False, HOST, {})
-
-
-def test_what_does_not_apply_is_said_so() -> None:
-    section = adapt_section(Path("adapt.json"), make_result("adapt", MADE, {"rows": [ROW]}))
-    line = "| matrix | 71.7 | 25.3 | 100.0 | -28.3 | n/a | +0.0 | n/a | 0 | +1.3 |"
-    assert line in section
-
-
-def test_a_curve_above_33_db_says_so_and_from_where_on_it_is() -> None:
-    row = replace(ROW, kbit_33db=None, lowest_psnr_db=34.62)
-    section = adapt_section(Path("adapt.json"), make_result("adapt", MADE, {"rows": [row]}))
-    assert "| matrix | n/a | 34.6 | 100.0 | n/a | n/a | +0.0 | n/a | 0 | +1.3 |" in section
-    row = replace(row, kbit_33db_at_most=20.0, recovered_percent=70.0)
-    section = adapt_section(Path("adapt.json"), make_result("adapt", MADE, {"rows": [row]}))
-    assert "| matrix | ≤ 20.0 | 34.6 | 100.0 | ≤ -80.0 | ≥ +70.0 |" in section
-
-
-def test_columns_that_no_row_has_are_left_out() -> None:
-    with_switches = replace(ROW, switches=3)
-    sections = [
-        adapt_section(Path("adapt.json"), make_result("adapt", MADE, {"rows": [row]}))
-        for row in (ROW, with_switches)
-    ]
-    assert ["switches" in section for section in sections] == [False, True]
-    assert not any("passes" in section for section in sections)
+def test_bits_are_told_as_a_bound_where_a_field_shows_more_before_a_bit_is_sent() -> None:
+    assert ROW.kbit_text == "71.7 (-28.3 %)"
+    assert replace(ROW, kbit_33db=None).kbit_text is None
+    assert replace(ROW, kbit_33db=None, kbit_33db_at_most=20.0).kbit_text == "≤ 20.0 (-80.0 %)"

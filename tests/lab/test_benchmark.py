@@ -18,11 +18,11 @@ from lab.benchmark.definition import (
     V1,
     Benchmark,
     BenchmarkDrive,
-    benchmark_section,
     described,
     print_scores,
     read_benchmark,
     record_anchors,
+    score_parts,
     score_rows,
 )
 from lab.benchmark.method import (
@@ -33,10 +33,10 @@ from lab.benchmark.method import (
     run_method,
 )
 from lab.benchmark.submission import check_submission, read_submission
+from lab.cli import parse
 from rfcore.errors import CodecError, InvalidData, InvalidInput, RfedgeError
 from rfcore.image import I420, write_png
 from rfcore.native.yuv import rgb_from_i420
-from rfedge.cli import parse
 from rfedge.evaluate.clips import Clip, read_drive
 from rfedge.evaluate.compare.drives import rival_families
 from rfedge.evaluate.compare.measure import BOOTSTRAP_SEED, WINDOWS_DB
@@ -203,7 +203,7 @@ def test_x264_by_a_command_scores_as_the_rival_of_the_comparison(
     small: Benchmark, handed_in: Path, thumbnail: Any, tmp_path: Path
 ) -> None:
     """The same encoder by both doors: equal packets, equal errors, no difference in rate."""
-    from rfedge.evaluate.cells import CellStore
+    from rfedge.jobs import CellStore
 
     drive = read_drive(thumbnail.drive)
     rival = perform(drive.clip(), small.anchors[0], CellStore(tmp_path), timed=False)
@@ -228,9 +228,9 @@ def test_a_result_says_what_was_checked_and_what_was_not(small: Benchmark, hande
     console = Console(record=True, width=120)
     print_scores(console, result)
     assert "Not checked: " in console.export_text()
-    section = benchmark_section(Path("benchmark.json"), result)
-    assert "| wall | 10 | x264-lowdelay-veryfast | 32..36 | 0.0 |" in section
-    assert "* wall: the prior of 10 bytes is never paid for." in section
+    table, remarks = score_parts(result)
+    assert table.cells[0][:5] == ["wall", "10", "x264-lowdelay-veryfast", "32..36", "+0.0"]
+    assert "* wall: the prior of 10 bytes is never paid for." in remarks
 
 
 def test_pictures_may_be_handed_in_as_png(small: Benchmark, copied: Path, handed_in: Path) -> None:
@@ -527,11 +527,11 @@ def test_our_own_coder_goes_through_the_same_door(
 
 
 def test_the_command_line_shows_the_definition(capsys: pytest.CaptureFixture[str]) -> None:
-    parse(["eval", "benchmark", "show"]).run()
+    parse(["benchmark", "show"]).run()
     assert "rfedge-bench v1, definition " in capsys.readouterr().out
 
 
 def test_the_command_line_names_drives_by_example() -> None:
-    verb = parse(["eval", "benchmark", "check", "out/mine", "--drive", "kitti-loop"])
+    verb = parse(["benchmark", "check", "out/mine", "--drive", "kitti-loop"])
     with pytest.raises(InvalidInput, match="'kitti-loop' is not NAME=DATASET"):
         verb.run()

@@ -43,7 +43,7 @@ from rfedge.sizing.estimate import Assumptions, Demand, estimate
 from rfedge.sizing.tables import shipped_tables
 
 SAMPLE = sample_path("sizing/city.toml")
-RESULTS = Path(__file__).parents[2] / "results"
+RESULTS = Path(__file__).parents[2] / "lab/results"
 DEMAND = Demand(1, 640, 360, 10.0, 34.0)
 COSTS = Costs(1, 10.0, 3000.0, (0.8, 1.0, 1.2), 0.04, 0.03, 0.02, 100.0)
 

@@ -14,12 +14,10 @@ from lab.city.flow import Costs, costs_of
 from lab.city.plan import MinuteRow, plan_city
 from lab.city.sessions import SampledServer, SessionFigures, run_sessions
 from lab.city.traffic import stated_traffic
+from lab.cli import parse
 from rfcore.errors import InvalidInput
-from rfedge.cli import parse
 from rfedge.samples import sample_path
 from rfedge.sizing.tables import shipped_tables
-
-DOCS = Path(__file__).parents[2] / "docs"
 
 
 def town() -> tuple[City, Costs]:
@@ -134,7 +132,7 @@ def test_a_city_is_planned_into_a_report(
     pressed.write_text(
         sample_path("sizing/city.toml").read_text().replace("cores = 6", "cores = 1")
     )
-    asked = ["size", "--city", str(pressed), "--out", str(tmp_path)]
+    asked = ["city", str(pressed), "--out", str(tmp_path)]
     parse([*asked, "--step-s", "5", "--samples", "1", "--sample-s", "2"]).run()
     said = capsys.readouterr().out
     assert "First broken: cores that a server may promise" in said.replace("\n", " ")
@@ -155,9 +153,9 @@ def test_a_trace_takes_the_place_of_the_demand(tmp_path: Path) -> None:
     )
     trace = tmp_path / "fcd.xml"
     trace.write_text(f"<fcd-export>{steps}</fcd-export>")
-    city = ["--city", str(sample_path("sizing/city.toml")), "--samples", "0"]
+    city = ["city", str(sample_path("sizing/city.toml")), "--samples", "0"]
     out = ["--out", str(tmp_path / "out"), "--json", str(tmp_path / "city.json")]
-    parse(["size", *city, "--fcd", str(trace), *out]).run()
+    parse([*city, "--fcd", str(trace), *out]).run()
     result = json.loads((tmp_path / "city.json").read_text())
     assert [row["vehicles"] for row in result["minutes"]] == [1.0, 1.0]
     assert sum(60 * row["handovers_per_s"] for row in result["minutes"]) == pytest.approx(1)
@@ -167,17 +165,12 @@ def test_a_trace_takes_the_place_of_the_demand(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--fcd", "x.xml"], "fcd: .*give --city too"),
-        (["--sumo", "x.sumocfg"], "sumo: .*give --city too"),
-        (["--city", "CITY", "--fcd", "x.xml", "--sumo", "x.sumocfg"], "give one of them"),
-        (["--city", "CITY", "--samples", "-1"], "samples"),
-        (["--city", "CITY", "--sample-s", "0"], "sample-s"),
-        (["--city", "CITY", "--step-s", "0", "--samples", "0"], "step-s"),
-        (["--city", "CITY", "--drive", "x"], "leave --drive out"),
+        (["--samples", "-1"], "samples"),
+        (["--sample-s", "0"], "sample-s"),
+        (["--step-s", "0", "--samples", "0"], "step-s"),
     ],
 )
 def test_what_cannot_be_planned_is_said(tmp_path: Path, arguments: list[str], said: str) -> None:
     city = str(sample_path("sizing/city.toml"))
-    given = [city if argument == "CITY" else argument for argument in arguments]
     with pytest.raises(InvalidInput, match=said):
-        parse(["size", *given, "--out", str(tmp_path)]).run()
+        parse(["city", city, *arguments, "--out", str(tmp_path)]).run()

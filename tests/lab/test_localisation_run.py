@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
-from lab.localisation import EvalLocalise
+from lab.localisation import EvalLocalise, measure
 from lab.localisation.false_starts import false_starts, row_of
 from lab.localisation.given import GivenDrive
-from lab.localisation.measure import Piece, pieces, rows_of_pieces
+from lab.localisation.measure import WantedRow, rows_asked_for, run_localise
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
@@ -53,19 +54,24 @@ def test_a_row_that_is_there_is_not_measured_again_and_any_other_setting_is_anot
     text = f"a={SAMPLES / 'street/transforms_drive_empty.json'},{SAMPLES / 'fields/street.rff'}"
     elsewhere = SAMPLES / "street/transforms_drive_vehicles.json"
     asked = EvalLocalise(
-        drives=(text,), starts=("2m:3deg",), errors=("offset",), strangers=(elsewhere,)
+        drives=(text,),
+        starts=("2m:3deg",),
+        errors=("offset",),
+        strangers=(elsewhere,),
+        out=tmp_path / "localise.json",
+        cells=tmp_path / "cells",
     )
     measured = []
 
-    def rows(piece: Piece) -> list[dict[str, object]]:
-        measured.append(piece)
+    def rows(wanted: WantedRow) -> list[dict[str, object]]:
+        measured.append(wanted)
         return [{"row": len(measured)}]
 
-    monkeypatch.setattr(Piece, "rows", rows)
+    monkeypatch.setattr(WantedRow, "rows", rows)
+    monkeypatch.setattr(measure, "localise_parts", lambda _: ())
 
     def run(asked: EvalLocalise) -> list[int]:
-        found = pieces(asked, [GivenDrive.parse(text)])
-        return [row["row"] for row in rows_of_pieces(found, tmp_path / "cells", 1)]
+        return [row["row"] for row in run_localise(asked, Console(quiet=True))["rows"]]
 
     assert run(asked) == [1, 2]
     assert run(asked) == [1, 2]
@@ -105,8 +111,8 @@ def test_a_row_counts_right_poses_of_tries_and_wrong_ones_of_all() -> None:
 
 def test_a_drive_may_ask_for_searches_from_one_start_error_alone() -> None:
     asked = EvalLocalise(drives=("a=d.json,f.rff",), starts=("2m:3deg", "4m:8deg"))
-    (piece,) = pieces(asked, [GivenDrive.parse("a=d.json,f.rff,rows=1m:2deg")])
-    assert (piece.start, piece.sensor) == (StartError(1, 2), None)
+    (wanted,) = rows_asked_for(asked, [GivenDrive.parse("a=d.json,f.rff,rows=1m:2deg")])
+    assert (wanted.start, wanted.sensor) == (StartError(1, 2), None)
 
 
 def test_a_drive_without_a_field_is_refused() -> None:
@@ -119,7 +125,6 @@ def test_a_sensor_of_another_form_is_refused_before_any_work() -> None:
         EvalLocalise(drives=("a=d.json,f.rff",), errors=("whichever",)).run()
 
 
-def test_a_number_of_processes_that_cannot_be_is_refused(tmp_path: Path) -> None:
-    asked = EvalLocalise(drives=("a=b,c",), processes=0, out=tmp_path / "out.json")
+def test_a_number_of_processes_that_cannot_be_is_refused() -> None:
     with pytest.raises(InvalidInput, match="processes: 0 is outside"):
-        asked.run()
+        EvalLocalise(drives=("a=b,c",), processes=0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lab.paper import run
+from lab.paper import EvalPaper, run
 from lab.paper.figures import write_paper_figures, write_views
 from lab.paper.report import (
     PaperRow,
@@ -18,9 +18,9 @@ from lab.paper.report import (
     paper_tables,
     savings_by_frame,
 )
-from lab.paper.run import PaperJob, named_path, run_paper, views_of
+from lab.paper.run import named_path, run_paper, views_of
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.cells import CellStore
+from rfedge.evaluate.runner import Run
 from rfedge.evaluate.savings import intra_alone
 from rfedge.results import as_json
 
@@ -50,6 +50,10 @@ def row(frame, crf, savings, **other):
         "rf_residual_bands": (0.1, 0.2, 0.4, 0.8),
     }
     return PaperRow(**values | {"crf": crf, "frame": frame, "savings_percent": savings} | other)
+
+
+def result_of(rows):
+    return {"tables": [as_json(table) for table in paper_tables(rows)]}
 
 
 ROWS = [row("a", 18, 40.0), row("a", 23, 50.0), row("b", 18, 60.0), row("b", 23, 70.0)]
@@ -115,7 +119,8 @@ def test_savings_by_frame_leave_out_what_was_rendered_natively():
 
 
 def test_every_figure_has_its_numbers_beside_it(tmp_path):
-    paths = write_paper_figures(ROWS, tmp_path)
+    sized = [row("a", 18, 0.0, p_bytes=2000), row("b", 18, 0.0, p_bytes=500)]
+    paths = write_paper_figures(result_of(sized), tmp_path, "paper")
     assert {path.name for path in paths} == {
         "fig4_savings_empty_3dgs.svg",
         "fig4_savings_empty_3dgs.csv",
@@ -125,9 +130,9 @@ def test_every_figure_has_its_numbers_beside_it(tmp_path):
         "savings_by_crf_preset.csv",
     }
     assert (tmp_path / "fig4_savings_empty_3dgs.csv").read_text() == (
-        "image,300x168\n0,45.00\n1,65.00\n"
+        "image,300x168\n0,50.00\n1,80.00\n"
     )
-    assert "medium,18,50.00" in (tmp_path / "savings_by_crf_preset.csv").read_text()
+    assert "medium,18,65.00" in (tmp_path / "savings_by_crf_preset.csv").read_text()
 
 
 @pytest.mark.parametrize("text", ["x.rff", "=x", "a="])
@@ -140,13 +145,10 @@ def test_a_field_without_a_name_is_refused(text):
 def paper(thumbnail, tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
     drive = thumbnail.empty.partition("=")[2]
-    job = PaperJob(
+    job = EvalPaper(
         fields=(f"3dgs={thumbnail.field}",),
         drives=(f"wall={drive}",),
-        sizes_px=(
-            (96, 64),
-            (48, 32),
-        ),
+        sizes=("96x64", "48x32"),
         out=folder / "paper.json",
         cells=folder / "cells",
         quick=True,
@@ -162,10 +164,10 @@ def test_the_camera_frame_alone_is_coded_once_for_all_fields(thumbnail, tmp_path
         return intra_alone(frame, preset, crf)
 
     monkeypatch.setattr(run, "intra_alone", counted)
-    job = PaperJob(
+    job = EvalPaper(
         fields=(f"3dgs={thumbnail.field}", f"again={thumbnail.field}"),
         drives=(f"wall={thumbnail.empty.partition('=')[2]}",),
-        sizes_px=((48, 32),),
+        sizes=("48x32",),
         out=tmp_path / "paper.json",
         cells=tmp_path / "cells",
         quick=True,
@@ -192,7 +194,7 @@ def test_a_frame_is_read_once_and_rendered_once_at_its_own_size(paper, monkeypat
 
     monkeypatch.setattr(run, "_render", counted)
     monkeypatch.setattr(run, "read_dataset", dataset)
-    pieces = list(run._pieces(job, run._opened(job)))
+    pieces = list(run._shots(job, run._opened(job)))
     for piece in pieces:
         assert list(run._rows(piece))
     frames = {piece.source.picture.name for piece in pieces}
@@ -221,7 +223,7 @@ def test_every_frame_is_coded_at_every_setting_with_both_controls_beside_the_sma
 def test_the_field_saves_more_than_what_knows_nothing(paper):
     _, result = paper
     means = means_of(paper_rows(result))
-    means = {(mean.field, mean.size_px[0], mean.making): mean for mean in means}
+    means = {(mean.name, mean.size_px[0], mean.making): mean for mean in means}
     field = means["3dgs", 48, "native"].savings_percent
     assert field > means["3dgs:grey", 48, "native"].savings_percent
     assert field > means["3dgs:behind", 48, "native"].savings_percent
@@ -254,12 +256,13 @@ def test_what_is_left_is_told_by_a_picture_with_all_its_sizes(paper, tmp_path, m
     monkeypatch.setattr(run, "monotonic", lambda: next(clock_s))
     done = []
     monkeypatch.setattr(run, "_rows", lambda piece: done.append(piece) or [])
-    pictures = run._by_picture(job, list(run._pieces(job, run._opened(job))))
+    pictures = run._by_picture(job, list(run._shots(job, run._opened(job))))
     assert [len(pieces) for pieces in pictures] == [2, 2], "of two frames at two sizes"
-    run._say_cost(pictures, CellStore(tmp_path), Console(width=100), processes=1)
+    begun = Run.begin("paper", replace(job, cells=tmp_path), (), Console(width=100))
+    run._say_cost(pictures, begun, processes=1)
     assert done == pictures[0]
     assert capsys.readouterr().out == "2 pictures, 2 left, about 1.0 minutes\n"
-    run._say_cost(pictures[:1], CellStore(tmp_path), Console(width=100), processes=1)
+    run._say_cost(pictures[:1], begun, processes=1)
     assert capsys.readouterr().out == "1 pictures, nothing left to do\n"
 
 
@@ -281,32 +284,25 @@ def test_the_first_frame_of_each_drive_is_shown_as_camera_and_field_see_it(paper
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"fields": []}, "at least one field"),
-        ({"drives": []}, "at least one field, one drive"),
-        ({"sizes_px": []}, "one size"),
+        ({"fields": ()}, "at least one field"),
+        ({"drives": ()}, "at least one field, one drive"),
+        ({"sizes": ()}, "one size"),
         ({"every": 0}, "every"),
         ({"out": Path("x.csv")}, "out"),
     ],
 )
 def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
-    given = {
-        "fields": ["a=b"],
-        "drives": ["c=d"],
-        "sizes_px": [(96, 64)],
-        "out": Path("p.json"),
-        "cells": Path("cells"),
-    }
     with pytest.raises(InvalidInput, match=named):
-        PaperJob(**(given | change))
+        EvalPaper(**({"fields": ("a=b",), "drives": ("c=d",)} | change))
 
 
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_quick_run_gives_the_published_rows_and_its_controls(tmp_path):
-    job = PaperJob(
+    job = EvalPaper(
         fields=(f"3dgs={SAMPLES / 'fields' / 'street.rff'}",),
         drives=(f"empty={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
-        sizes_px=((300, 168),),
+        sizes=("300x168",),
         out=tmp_path / "paper.json",
         cells=tmp_path / "cells",
         quick=True,
@@ -315,7 +311,7 @@ def test_a_quick_run_gives_the_published_rows_and_its_controls(tmp_path):
     assert result == json.loads(job.out.read_text())
     assert run_paper(job, Console(quiet=True))["tables"] == result["tables"]
     means = means_of(paper_rows(result))
-    means = {(mean.field, mean.making): mean.savings_percent for mean in means}
+    means = {(mean.name, mean.making): mean.savings_percent for mean in means}
     field = means["3dgs", "native"]
     assert field > means["3dgs:behind", "native"] > 0
     assert field > means["3dgs:grey", "native"]
@@ -330,5 +326,7 @@ def test_views_stand_side_by_side(tmp_path):
 
 
 def test_a_scene_that_was_not_published_has_a_plain_name(tmp_path):
-    paths = write_paper_figures([replace(r, scene="night") for r in ROWS], tmp_path)
+    paths = write_paper_figures(
+        result_of([replace(r, scene="night") for r in ROWS]), tmp_path, "paper"
+    )
     assert "savings_night_3dgs.svg" in {path.name for path in paths}

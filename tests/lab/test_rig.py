@@ -1,15 +1,10 @@
-"""What ``rfedge-lab rig`` reads off the twin, and its rows as a section of the results page."""
-
-from dataclasses import asdict
-from pathlib import Path
+"""What ``rfedge-lab rig`` reads off the twin."""
 
 import pytest
 
-from lab.rig.report import CameraRow, SessionRow, rig_section
 from lab.rig.run import instants_apart, spreads_of
 from rfcore.camera import Intrinsics, Pose
 from rfcore.wire.twin import PictureEncoding, TwinPicture
-from rfedge.results import make_result, provenance
 
 
 def shown(camera_id: str, instant: int, captured_ms: int = 0, age_ms: int = 0) -> TwinPicture:
@@ -50,18 +45,3 @@ def test_instants_apart_counts_once_every_camera_has_shown_one() -> None:
     assert instants_apart([*pictures, shown("a", 4), shown("a", 5)], 2) == 2
     assert instants_apart(pictures, 3) is None
     assert instants_apart([*pictures, shown("a", 9), shown("b", 9)], 2) == 1, "4 to 8 were dropped"
-
-
-def test_rows_become_a_section_of_the_results_page() -> None:
-    camera = CameraRow("one CRF", "one", "front", 6, 5, 700.0, 810.0, 23.0, 35.25, 80.0, 95.0)
-    session = SessionRow(
-        "one CRF", "one", 4, (640, 360), 24, 23, 55_000, 48_000, 35.5, 33.1, 410.0, 6, 19.0, 41.0, 1
-    )
-    settings = {"link_bps": 4e6, "crf": 23.0, "rate_hz": 2.0, "max_delay_ms": 500.0}
-    content = {"settings": settings, "sessions": [asdict(session)], "rows": [asdict(camera)]}
-    result = make_result("rig", provenance(command="rfedge-lab rig"), content)
-    page = rig_section(Path("lab/results/rig.json"), result)
-    assert "4 x 640x360" in page
-    assert "5 of 6" in page
-    assert "35.25" in page
-    assert "500 ms" in page

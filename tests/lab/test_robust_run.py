@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lab.robust.report import robust_section, write_robust_figure
-from lab.robust.run import RobustJob, _interval, run_robust
+from lab.robust import EvalRobust
+from lab.robust.report import write_robust_figure
+from lab.robust.run import _interval, run_robust
 from rfcore.errors import InvalidInput
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -22,17 +23,17 @@ QUALITY_DB = 40.0
 def robust(thumbnail, tmp_path_factory):
     """A quick run on the thumbnail, its own drive standing for those of another lane and light."""
     folder = tmp_path_factory.mktemp("robust")
-    job = RobustJob(
-        thumbnail.field,
-        thumbnail.drive,
-        thumbnail.drive.replace("wall@", "dusk@"),
-        thumbnail.drive.replace("wall@", "lane@"),
-        "fast",
-        "ultrafast",
-        QUALITY_DB,
-        5,
-        folder / "robust.json",
-        folder / "cells",
+    job = EvalRobust(
+        field=thumbnail.field,
+        drive=thumbnail.drive,
+        dusk=thumbnail.drive.replace("wall@", "dusk@"),
+        lane=thumbnail.drive.replace("wall@", "lane@"),
+        effort="fast",
+        preset="ultrafast",
+        quality_db=QUALITY_DB,
+        frames=5,
+        out=folder / "robust.json",
+        cells=folder / "cells",
         quick=True,
     )
     return job, run_robust(job, Console(quiet=True))
@@ -145,19 +146,15 @@ def test_the_interval_of_a_mean_is_near_what_a_normal_distribution_has():
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):
+def test_a_quick_run_writes_rows_and_a_figure_and_goes_on(tmp_path):
     drive = SAMPLES / "street/transforms_drive_empty.json"
-    job = RobustJob(
-        SAMPLES / "fields/street.rff",
-        f"empty@10={drive}",
-        None,
-        None,
-        "fast",
-        "ultrafast",
-        33.0,
-        8,
-        tmp_path / "robust.json",
-        tmp_path / "cells",
+    job = EvalRobust(
+        drive=f"empty@10={drive}",
+        effort="fast",
+        preset="ultrafast",
+        frames=8,
+        out=tmp_path / "robust.json",
+        cells=tmp_path / "cells",
         quick=True,
     )
     result = run_robust(job, Console(quiet=True))
@@ -176,8 +173,7 @@ def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):
     assert not any("frames_found" in row for row in noise), "where they were measured"
     reasons = [r["reason"] for r in result["disturbances"] if "reason" in r]
     assert ["--lane" in reasons[0], "--dusk" in reasons[1]] == [True, True]
-    assert len(write_robust_figure(result, tmp_path / "figures")) == 2
-    assert "| render-only | 0 | 20 |" in robust_section(job.out, result)
+    assert len(write_robust_figure(result, tmp_path / "figures", "robust")) == 2
     assert run_robust(job, Console(quiet=True))["rows"] == result["rows"]
 
 
@@ -193,17 +189,5 @@ def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):
     ],
 )
 def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
-    given = {
-        "field": Path("a"),
-        "drive": "a@1=b",
-        "dusk": None,
-        "lane": None,
-        "effort": "default",
-        "preset": "medium",
-        "quality_db": 33.0,
-        "frames": 24,
-        "out": Path("c.json"),
-        "cells": Path("d"),
-    }
     with pytest.raises(InvalidInput, match=named):
-        RobustJob(**(given | change))
+        EvalRobust(**change)

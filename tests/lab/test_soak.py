@@ -1,13 +1,11 @@
 """What a soak calls growth."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from lab.soak import SoakRow, soak_section, what_grew
+from lab.soak import what_grew
 from rfedge.loadtest.usage import Sample
-from rfedge.results import make_result, provenance, read_result, write_result
 
 
 def looks(slope_mb: float = 0.0, **late: int) -> list[Sample]:
@@ -62,14 +60,3 @@ def test_a_thing_that_comes_and_goes_is_no_growth() -> None:
 def test_a_run_too_short_for_quarters_is_judged_all_the_same() -> None:
     assert what_grew(looks()[:2]) == []
     assert what_grew(looks(descriptors=41)[5:8]) == ["descriptors grew from 40 to 41"]
-
-
-def test_a_soak_is_a_row_of_the_results_page(tmp_path: Path) -> None:
-    row = SoakRow(
-        5.0, 2, 5.0, True, 3000, -0.25, 400.5, 15, 14, 3, 400.25, 15, 16, 3, 0.5, 40.0, None
-    )
-    path = tmp_path / "soak.json"
-    write_result(path, make_result("soak", provenance(), {"rows": [row]}))
-    section = soak_section(path, read_result(path, "soak"))
-    assert "| 5.00 | 2 | 5.00 | True | 3000 | -0.25 | 400.50 |" in section
-    assert section.rstrip().endswith("| 0.50 | 40.00 | not run |")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lab.city.city import City, Density, VehicleKind, grid_city, read_city
-from lab.city.traffic import REACH, CellMap, stated_traffic, sumo_traffic, trace_traffic
+from lab.city.traffic import REACH, CellMap, stated_traffic, trace_traffic
 from rfcore.errors import InvalidData, InvalidInput
 from rfedge.samples import sample_path
 from rfedge.sizing.estimate import Demand
@@ -174,37 +174,3 @@ def test_a_city_without_demand_needs_a_trace() -> None:
         next(stated_traffic(replace(town(), density=None)))
     with pytest.raises(InvalidInput, match="step-s"):
         next(stated_traffic(town(), 0.0))
-
-
-# --- SUMO, stepped here
-
-
-CROSSING = sample_path("sizing/crossing/crossing.sumocfg")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("end", ["", "<end value='70'/>"], ids=["until all are gone", "an end"])
-def test_a_simulation_counts_as_its_fcd_output_does(tmp_path: Path, end: str) -> None:
-    for name in ("crossing.net.xml", "crossing.rou.xml"):
-        (tmp_path / name).write_bytes(CROSSING.with_name(name).read_bytes())
-    output = f"<output><fcd-output value='{tmp_path}/fcd.xml'/></output></configuration>"
-    text = re.sub("<end.*/>", end, CROSSING.read_text()).replace("</configuration>", output)
-    stepped = list(sumo_traffic(town(), written(tmp_path, text, "own.sumocfg")))
-    read = list(trace_traffic(town(), tmp_path / "fcd.xml"))
-    assert [block.start_s for block in stepped] == [60.0 * i for i in range(len(read))]
-    assert len(read) == (2 if end else 3)
-    for ours, theirs in zip(stepped, read, strict=True):
-        assert ours.step_s == theirs.step_s == 0.5
-        for name in ("vehicles", "handovers_per_s", "begun_per_s", "outside"):
-            assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
-    assert sum(block.vehicles.sum() for block in stepped) > 500
-    assert sum(block.handovers_per_s.sum() * 0.5 for block in stepped) >= 5
-
-
-@pytest.mark.slow
-def test_what_sumo_cannot_run_is_an_error_and_the_next_simulation_runs(tmp_path: Path) -> None:
-    with pytest.raises(
-        InvalidData, match=r"own\.sumocfg: SUMO does not run it, it says why above: Process"
-    ):
-        list(sumo_traffic(town(), written(tmp_path, "<configuration/>", "own.sumocfg")))
-    assert list(sumo_traffic(town(), CROSSING))

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from rfcore.codec.h264.config import DEFAULT_EFFORT
+from rfcore.codec.h264.config import DEFAULT_EFFORT, check_effort
+from rfcore.errors import InvalidInput
+from rfedge.evaluate import Experiment, Preset
 
 __all__ = ["EvalCompare"]
 
-Preset = Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium"]
 
-
-@dataclass(frozen=True)
-class EvalCompare:
+@dataclass(frozen=True, kw_only=True)
+class EvalCompare(Experiment):
     """Compare with low-delay x264, x265 and SVT-AV1 at equal quality, and at equal processor time.
 
     Prints what it will cost before it starts; stopped and started again, it goes on where it was.
@@ -34,13 +35,11 @@ class EvalCompare:
     """The same for the empty street of a drive, frame by frame at its poses: tells what is not in
     the field, for the split of the bits and for a rival that sends only the foreground."""
     effort: str = DEFAULT_EFFORT
-    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
+    """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: Preset = "veryfast"
     """x264 preset of the anchor."""
     out: Path = Path("out/eval/compare.json")
-    """The result file to write."""
     cells: Path = Path("out/eval/compare")
-    """Folder of finished pieces."""
     method: tuple[str, ...] = ()
     """More codecs to compare with, as package.module:Class (see docs/explanation/evaluation.md)."""
     rivals: tuple[str, ...] = ()
@@ -49,8 +48,6 @@ class EvalCompare:
     window: tuple[float, float] | None = None
     """Lowest and highest luma PSNR to compare over, in dB; 32 35 (and 30 35 where all reach it) if
     not given. Curves are coded at more points until they span it."""
-    quick: bool = False
-    """Eight frames and few rivals: to see that it works, not for figures."""
     retime: bool = False
     """Take the processor times anew (on a quiet machine) and keep everything else."""
     processes: int = 1
@@ -62,38 +59,31 @@ class EvalCompare:
     figures: Path | None = None
     """Folder for the curves as SVG, with their numbers as CSV."""
 
-    def run(self) -> None:
-        """Run what is not there yet and write the rows."""
-        from functools import partial
+    def __post_init__(self) -> None:
+        from rfedge.jobs import check_processes
 
+        super().__post_init__()
+        check_processes(self.processes)
+        check_effort("effort", self.effort)
+        if not (self.drives or self.decimated):
+            raise InvalidInput("drives", "there is none")
+        if self.window is not None:
+            low_db, high_db = self.window
+            if not 0 < low_db < high_db < math.inf:
+                raise InvalidInput("window", f"{low_db:g} {high_db:g} are not two rising decibels")
+
+    def run(self) -> None:
+        """Run what is not there yet, write the rows and print them."""
         from rich.console import Console
 
         from rfcore.extras import require
         from rfedge.arguments import field_path
-        from rfedge.evaluate.compare.drives import CompareJob
-        from rfedge.evaluate.compare.run import code_on_ray, run_compare
+        from rfedge.evaluate.compare.run import run_compare
 
-        job = CompareJob(
-            field=field_path(self.field),
-            drives=self.drives,
-            effort=self.effort,
-            preset=self.preset,
-            out=self.out,
-            cells=self.cells,
-            decimated=self.decimated,
-            backgrounds=self.background,
-            methods=self.method,
-            rivals=self.rivals,
-            quick=self.quick,
-            retime=self.retime,
-            window_db=self.window,
-            processes=self.processes,
-        )
-        console = Console()
         if self.ray is not None:
             require("ray", "ray")
-            code_on_ray(job, self.ray, partial(print, flush=True))
-        result = run_compare(job, console)
+        console = Console()
+        result = run_compare(replace(self, field=field_path(self.field)), console)
         if self.figures is not None:
             from rfedge.evaluate.compare.figures import write_compare_figures
 

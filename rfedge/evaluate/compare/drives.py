@@ -1,4 +1,4 @@
-"""What is compared on each drive: our codec, families of rival settings, codecs a user brings.
+"""What a comparison codes on each drive: our codec, families of rival settings, a user's codecs.
 
 Drives are read and rendered, and users' codecs loaded, before anything is coded.
 """
@@ -6,7 +6,6 @@ Drives are read and rendered, and users' codecs loaded, before anything is coded
 from __future__ import annotations
 
 import importlib
-import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,12 +17,10 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.codec.h264.config import check_effort
 from rfcore.codec.references import RENDER_ONLY, References
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.train import mean_psnr_db
-from rfedge.evaluate.cells import check_processes, program_version
 from rfedge.evaluate.clips import (
     DECIMATION,
     Clip,
@@ -33,10 +30,9 @@ from rfedge.evaluate.clips import (
     DriveOfField,
     read_drive,
 )
+from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.compare.foreground import ForegroundCoder, foreground_mask
-from rfedge.evaluate.compare.measure import WINDOWS_DB
 from rfedge.evaluate.field_coder import WITHOUT_FIELD, FieldCoder, RenderedClip, render_clip
-from rfedge.evaluate.rate_curve import Window
 from rfedge.evaluate.rivals import (
     Rival,
     svtav1_lowdelay,
@@ -48,13 +44,14 @@ from rfedge.evaluate.rivals import (
     x265_for_ssim,
     x265_lowdelay,
 )
-from rfedge.results import check_result_path
+from rfedge.evaluate.runner import program_version
 
 __all__ = [
     "PAID_AGAINST",
-    "CompareJob",
     "DriveComparison",
+    "asked_families",
     "foreign_coder",
+    "jobs_of_drives",
     "read_drive_comparisons",
     "rival_families",
     "ssim_rivals",
@@ -62,7 +59,7 @@ __all__ = [
 
 
 PAID_AGAINST = "x264-lowdelay-psnr"
-"""Whose bytes must be saved before a field is paid for."""
+"""The rival against which a field has to save its own bytes."""
 KEYINTS = (10, 30, 250)
 OUR_TOOLS_PRESETS = ("veryfast", "medium", "veryslow")
 
@@ -176,7 +173,7 @@ QUICK_FRAMES = 8
 
 @dataclass(frozen=True)
 class Method:
-    """How ours codes a drive; ``None`` leaves references to the encoder, the effort to the job."""
+    """How our coder codes a drive; None leaves references to the encoder, the effort to the job."""
 
     references: References | None = None
     effort: str | None = None
@@ -188,74 +185,43 @@ METHODS = {
     "rfedge-render-only": Method(RENDER_ONLY),
     "rfedge-without-field": Method(WITHOUT_FIELD),
 }
-"""Ours first, then with nearly x264 medium's time for a slice, then what is left of it without a
-past, and without a field: what each is worth."""
+"""Our coder as it is; with nearly as much time for a slice as x264 medium takes; and without a past
+and without a field, which tells what each is worth."""
 
 
-@dataclass(frozen=True)
-class CompareJob:
-    """What to compare; see ``rfedge eval compare --help``."""
+def asked_families(job: EvalCompare) -> dict[str, list[ClipCoder]]:
+    """Return the rivals that are asked for, and the one that a field is paid for against.
 
-    field: Path
-    drives: Sequence[str]
-    effort: str
-    preset: str
-    out: Path
-    cells: Path
-    decimated: Sequence[str] = ()
-    backgrounds: Sequence[str] = ()
-    methods: Sequence[str] = ()
-    rivals: Sequence[str] = ()
-    quick: bool = False
-    retime: bool = False
-    window_db: Window | None = None
-    processes: int = 1
+    Raises ``InvalidInput`` for a name that is no family of rivals.
+    """
+    families = rival_families(job.preset, quick=job.quick)
+    for name in job.rivals:
+        if name not in families:
+            raise InvalidInput("rivals", f"{name!r} is none of {', '.join(families)}")
+    wanted = {PAID_AGAINST, *(job.rivals or families)}
+    return {name: family for name, family in families.items() if name in wanted}
 
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-        check_processes(self.processes)
-        check_effort("effort", self.effort)
-        if not (self.drives or self.decimated):
-            raise InvalidInput("drives", "there is none")
-        low_db, high_db = self.windows_db[0]
-        if not 0 < low_db < high_db < math.inf:
-            raise InvalidInput("window", f"{low_db:g} {high_db:g} are not two rising decibels")
-        known = rival_families(self.preset, quick=self.quick)
-        for name in self.rivals:
-            if name not in known:
-                raise InvalidInput("rivals", f"{name!r} is none of {', '.join(known)}")
 
-    def rival_families(self) -> dict[str, list[ClipCoder]]:
-        """Return those of the rivals that are asked for, and whom a field is paid for against."""
-        families = rival_families(self.preset, quick=self.quick)
-        wanted = {PAID_AGAINST, *(self.rivals or families)}
-        return {name: family for name, family in families.items() if name in wanted}
+def jobs_of_drives(job: EvalCompare) -> list[EvalCompare]:
+    """Return a job for every drive, each with the background that stands behind it."""
+    behind = {_name(DriveName.parse(text)): text for text in job.background}
 
-    def of_each_drive(self) -> list[CompareJob]:
-        """Return a job for every drive, each with the background that stands behind it."""
-        behind = {_name(DriveName.parse(text)): text for text in self.backgrounds}
+    def whole(text: str) -> EvalCompare:
+        background = behind.get(_name(DriveOfField.parse(text, job.field).name))
+        backgrounds = () if background is None else (background,)
+        return replace(job, drives=(text,), decimated=(), background=backgrounds)
 
-        def whole(text: str) -> CompareJob:
-            background = behind.get(_name(DriveOfField.parse(text, self.field).name))
-            backgrounds = () if background is None else (background,)
-            return replace(self, drives=(text,), decimated=(), backgrounds=backgrounds)
-
-        slow = [replace(self, drives=(), decimated=(d,), backgrounds=()) for d in self.decimated]
-        return [*map(whole, self.drives), *slow]
-
-    @property
-    def windows_db(self) -> tuple[Window, ...]:
-        """The qualities asked about, the one that must be spanned first."""
-        return WINDOWS_DB if self.window_db is None else (self.window_db,)
+    slow = [replace(job, drives=(), decimated=(d,), background=()) for d in job.decimated]
+    return [*map(whole, job.drives), *slow]
 
 
 @dataclass(frozen=True)
 class DriveComparison:
-    """One drive with everybody who codes it, ours (``methods``) from what the field shows.
+    """One drive with every coder of it, ours (``methods``) with what the field shows.
 
-    ``field``: the field's archive.
-    ``foregrounds``: bool [H, W] a frame, what differs from the empty street, if a ``background``
-    drive shows that; else nothing. ``background``: its digest.
+    ``field`` is the field's archive. ``foregrounds`` has a bool [H, W] for each frame, true where
+    it differs from the empty street that the drive of digest ``background`` shows; without one
+    nothing differs.
     """
 
     clip: Clip
@@ -275,18 +241,18 @@ class DriveComparison:
 
     @property
     def compared(self) -> list[ClipCoder]:
-        """Everybody who takes part in the BD-rates, ours first."""
+        """All coders that take part in the BD-rates, ours first."""
         rivals = [coder for family in self.families.values() for coder in family]
         return [*self.methods, *{rival.name: rival for rival in rivals}.values()]
 
     @property
     def coders(self) -> list[ClipCoder]:
-        """All of them, ours first."""
+        """All coders, ours first."""
         last = [] if self.foreground_only is None else [self.foreground_only]
         return [*self.compared, *(c for family in self.for_ssim.values() for c in family), *last]
 
 
-def read_drive_comparisons(job: CompareJob) -> list[DriveComparison]:
+def read_drive_comparisons(job: EvalCompare) -> list[DriveComparison]:
     """Return a comparison per drive.
 
     Raises ``InvalidInput`` for a background that does not fit its drive, and as ``read_drive``.
@@ -296,7 +262,7 @@ def read_drive_comparisons(job: CompareJob) -> list[DriveComparison]:
         [DriveOfField.parse(text, job.field) for text in texts]
         for texts in (job.drives, job.decimated)
     )
-    behind = {_name(name): name for name in map(DriveName.parse, job.backgrounds)}
+    behind = {_name(name): name for name in map(DriveName.parse, job.background)}
     unknown = behind.keys() - {_name(drive.name) for drive in drives}
     if unknown:
         raise InvalidInput("background", f"there is no drive {sorted(unknown)} to stand behind")
@@ -318,15 +284,15 @@ def _name(name: DriveName) -> tuple[str, float]:
 
 
 def _drive_comparison(
-    job: CompareJob,
+    job: EvalCompare,
     given: DriveOfField,
     drive: Drive,
     background: Drive | None,
     field: RadianceField,
 ) -> DriveComparison:
     clip = drive.clip(field_psnr_db=mean_psnr_db(field, drive.pictures))
-    families = job.rival_families()
-    families |= {coder.name: [coder] for coder in map(foreign_coder, job.methods)}
+    families = asked_families(job)
+    families |= {coder.name: [coder] for coder in map(foreign_coder, job.method)}
     rendered = render_clip(field, drive.cameras)
     foregrounds = _foregrounds(drive, background)
     behind = None if background is None else background.digest

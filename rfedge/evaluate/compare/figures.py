@@ -13,7 +13,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.compare.report import (
+from rfedge.evaluate.compare.rows import (
     BEST_OF_ANY_CPU,
     HEADLINE_ANCHOR,
     CompareRow,

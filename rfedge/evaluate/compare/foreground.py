@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfedge.evaluate.clips import STEADY, Clip, CodedClip, luma_mse, luma_sse, psnr_of_mse
-from rfedge.evaluate.compare.report import ForegroundRow
+from rfedge.evaluate.compare.rows import ForegroundRow
 from rfedge.evaluate.picture_quality import luma_ssim
 from rfedge.evaluate.rate_curve import RateCurve, bd_rate_percent
 from rfedge.evaluate.rivals import Rival, x264_for_psnr

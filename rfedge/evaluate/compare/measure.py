@@ -17,7 +17,7 @@ import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfedge.evaluate.clips import STEADY, Clip, CodedClip, psnr_of_mse
-from rfedge.evaluate.compare.report import (
+from rfedge.evaluate.compare.rows import (
     BEST,
     BEST_OF_ANY_CPU,
     BreakEvenRow,
@@ -45,11 +45,11 @@ __all__ = [
 ]
 
 WINDOWS_DB: tuple[Window, ...] = (HEADLINE_DB, (30.0, 33.0), (30.0, 35.0), (35.0, 38.0))
-"""The headline window first."""
+"""The headline window, then others."""
 ANCHORS_AND_BEST = ("x264-lowdelay", "x264-our-tools", BEST, BEST_OF_ANY_CPU)
-"""How the names begin of those that are compared over the other windows, too."""
+"""Beginnings of the names of families that are compared over the other windows, too."""
 SSIM_WINDOW: Window = (0.88, 0.92)
-"""Mean SSIM of the luma: about what 33 to 35 dB show on the streets at hand."""
+"""Window of the luma's mean SSIM, about that of 33 to 35 dB on the streets at hand."""
 SAVING_AT_DB = (31.0, 33.0, 35.0)
 BOOTSTRAP_SEED = 2026
 PASSES = (1, 10, 100)
@@ -87,7 +87,7 @@ def _window_rows(
     window: Window,
     begins: tuple[str, ...] = ("",),
 ) -> list[CompareRow]:
-    """Return the rows of one window against those whose name begins as one of ``begins``."""
+    """Return the rows of one window against families whose names begin like one of ``begins``."""
     return [
         _row(clip, method, name, rival, window)
         for name, rival in _chosen(method, families, window).items()
@@ -98,7 +98,7 @@ def _window_rows(
 def _chosen(
     method: Performance, families: Mapping[str, Sequence[Performance]], window: Window
 ) -> dict[str, Performance]:
-    """Return who stands for each family, and the best rivals."""
+    """Return the setting that stands for each family, and the best rivals."""
 
     def strongest(rivals: Sequence[Performance]) -> Performance:
         return min(rivals, key=lambda rival: rival.steady.mean_log_bytes(window))
@@ -201,7 +201,7 @@ def _deviation_db(clip: CodedClip) -> float:
 def curve_rows(
     clip: Clip, methods: Sequence[Performance], families: Mapping[str, Sequence[Performance]]
 ) -> list[CurveRow]:
-    """Return the steady-state curve of everybody, from the lowest quality to the highest."""
+    """Return the steady-state curve of every coder, from the lowest quality to the highest."""
     everybody = {"": methods, **families}
     return [_curve(clip, family, who) for family, those in everybody.items() for who in those]
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional
 
+from rfcore.errors import InvalidInput
+from rfedge.evaluate import Experiment
 from rfedge.samples import sample_path
 
 __all__ = ["EvalLadder"]
 
+LEAST_FRAMES = 3
 
-@dataclass(frozen=True)
-class EvalLadder:
+
+@dataclass(frozen=True, kw_only=True)
+class EvalLadder(Experiment):
     """Measure every rung of the ladder: milliseconds of sender and receiver, bits and quality.
 
     The result is what `cav-agent --deadline-ms 33 --ladder FILE` chooses from. Prints what it will
@@ -28,26 +32,27 @@ class EvalLadder:
     frames: int = 24
     """How many of its pictures."""
     out: Path = Path("out/eval/ladder.json")
-    """The result file to write."""
     figures: Path = Path("out/eval/figures")
     """Folder of the figure (SVG, and CSV with its numbers)."""
     cells: Path = Path("out/eval/ladder")
-    """Folder of finished pieces."""
-    quick: bool = False
-    """Four frames and few rungs: to see that it works, not for figures."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.fields:
+            raise InvalidInput("fields", "name at least one field")
+        if self.frames < LEAST_FRAMES:
+            raise InvalidInput("frames", f"{self.frames} must be at least {LEAST_FRAMES}")
 
     def run(self) -> None:
         """Measure what is not there yet, write rows and figure, print the front."""
         from rich.console import Console
 
         from rfedge.arguments import field_path
-        from rfedge.evaluate.ladder.page import print_front, write_ladder_figure
-        from rfedge.evaluate.ladder.run import LadderJob, run_ladder
+        from rfedge.evaluate.ladder.rows import write_ladder_figure
+        from rfedge.evaluate.ladder.run import run_ladder
 
         console = Console()
-        fields = tuple(field_path(name) for name in self.fields)
-        job = LadderJob(fields, self.drive, self.out, self.cells, self.frames, self.quick)
+        job = replace(self, fields=tuple(field_path(name) for name in self.fields))
         result = run_ladder(job, console)
-        print_front(console, result)
-        for path in write_ladder_figure(result, self.figures):
+        for path in write_ladder_figure(result, self.figures, "ladder"):
             console.print(f"  {path}")

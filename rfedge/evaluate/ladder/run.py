@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -25,13 +24,15 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.field.interface import NGP, SPLATS
 from rfcore.field.quality import DETAILS, Quality
-from rfedge.evaluate.cells import CellKey, CellStore, program_version
 from rfedge.evaluate.clips import Drive, DriveName, read_drive
+from rfedge.evaluate.ladder import LEAST_FRAMES, EvalLadder
 from rfedge.evaluate.ladder.measure import TimedRenders, measure_rung, time_renders, track_drive
-from rfedge.evaluate.ladder.page import LadderRow, TrackingRow
-from rfedge.results import check_result_path, make_result, provenance, rows_of, write_result
+from rfedge.evaluate.ladder.rows import LadderRow, TrackingRow, front_table
+from rfedge.evaluate.runner import Run, program_version
+from rfedge.jobs import CellKey
+from rfedge.results import rows_of
 
-__all__ = ["CRFS", "LadderJob", "fronts", "rate_percents", "run_ladder", "rungs_for"]
+__all__ = ["CRFS", "fronts", "rate_percents", "run_ladder", "rungs_for"]
 
 
 RungRow = Mapping[str, Any]
@@ -112,8 +113,8 @@ def _curve(rows: Sequence[RungRow]) -> tuple[list[float], list[float]]:
 
 
 def fronts(rows: Sequence[RungRow]) -> list[bool]:
-    """Tell of each row whether no other at its CRF takes less of the sender's time without more
-    bits at equal quality, or fewer bits without more time."""
+    """Return of each row whether it is on the front: no other row at its CRF takes less of the
+    sender's time without more bits at equal quality, or fewer bits without more time."""
     return [not any(_beats(other, row) for other in rows) for row in rows]
 
 
@@ -126,34 +127,15 @@ def _beats(other: RungRow, row: RungRow) -> bool:
 
 
 QUICK_FRAMES = 4
-PROBE_FRAMES = 3
+PROBE_FRAMES = LEAST_FRAMES
 NOMINAL_RATE_HZ = 10.0
-"""A drive has a rate; bits and times of a rung do not depend on it."""
+"""Rate that the drive is named with; bits and times of a rung do not depend on it."""
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class LadderJob:
-    """What to measure; see ``rfedge eval ladder --help``."""
-
-    fields: Sequence[Path]
-    drive: Path
-    out: Path
-    cells: Path
-    frames: int
-    quick: bool = False
-
-    def __post_init__(self) -> None:
-        if not self.fields:
-            raise InvalidInput("fields", "name at least one field")
-        check_result_path(self.out)
-        if self.frames < PROBE_FRAMES:
-            raise InvalidInput("frames", f"{self.frames} must be at least {PROBE_FRAMES}")
-
-
-@dataclass(frozen=True)
 class Contender:
-    """One field with the rungs it is measured on, and its drive's renders as they are needed."""
+    """One field with the rungs it is measured on, and its drive's renders, made when needed."""
 
     field: RadianceField
     drive: Drive
@@ -177,7 +159,7 @@ class Contender:
         return self._kept[quality]
 
     def key(self, rung: Rung, crf: float) -> CellKey:
-        """Name the cell of a rung at a CRF."""
+        """Return the key of a rung at a CRF."""
         return {
             "verb": "ladder",
             "field": self.field.field_id,
@@ -197,7 +179,7 @@ class Contender:
         }
 
     def measured(self, rung: Rung, crf: float) -> Row:
-        """Return the row of a rung at a CRF, but for what takes the others to say."""
+        """Return the row of a rung at a CRF, without what depends on other rungs."""
         quality = rung.quality
         return {
             "rung": f"{self.field.metadata.kind} {rung.name} crf{crf:g}",
@@ -233,29 +215,27 @@ class Contender:
         }
 
 
-def run_ladder(job: LadderJob, console: Console) -> dict[str, Any]:
-    """Measure what is not measured yet, write ``job.out``, and return its content.
+def run_ladder(job: EvalLadder, console: Console) -> dict[str, Any]:
+    """Measure what is not measured yet, write the result and print the front.
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is measured if an input is wrong.
     """
     name = DriveName(job.drive.stem, NOMINAL_RATE_HZ, job.drive)
     drive = read_drive(name, QUICK_FRAMES if job.quick else job.frames)
-    made = provenance(job.fields)
+    run = Run.begin("ladder", job, job.fields, console)
     contenders = [
         Contender(load_field(path), drive, program_version(), job.quick) for path in job.fields
     ]
-    store = CellStore(job.cells)
-    _say_cost(contenders, store, console)
+    _say_cost(contenders, run)
     curves = [
-        [_row(contender, rung, crf, store, console) for crf in CRFS]
+        [_row(contender, rung, crf, run) for crf in CRFS]
         for contender in contenders
         for rung in contender.rungs
     ]
     rows = _judged(curves)
     measured = [(c, rung) for c in contenders for rung in c.rungs]
-    tracking = _tracking(list(zip(measured, curves, strict=True)), store, console)
+    tracking = _tracking(list(zip(measured, curves, strict=True)), run)
     content = {
-        "quick": job.quick,
         "threads": 1,
         "size_px": drive.frames[0].size_px,
         "fields": [
@@ -271,13 +251,11 @@ def run_ladder(job: LadderJob, console: Console) -> dict[str, Any]:
         "rows": rows,
         "tracking": tracking,
     }
-    result = make_result("ladder", made, content)
-    write_result(job.out, result)
-    return result
+    return run.finish(content, front_table)
 
 
 def _judged(curves: Sequence[Sequence[Row]]) -> list[LadderRow]:
-    """Add to every row what only the whole ladder can say: rate against its first rung, front."""
+    """Add to every row its rate against the ladder's first rung, and whether it is on the front."""
     rates = rate_percents(curves)
     rows = [
         {**row, "rate_percent": rate}
@@ -288,23 +266,22 @@ def _judged(curves: Sequence[Sequence[Row]]) -> list[LadderRow]:
     return rows_of(LadderRow, [{**row, "on_front": on} for row, on in on_front])
 
 
-def _row(contender: Contender, rung: Rung, crf: float, store: CellStore, console: Console) -> Row:
+def _row(contender: Contender, rung: Rung, crf: float, run: Run) -> Row:
     def make() -> list[Row]:
         row = contender.measured(rung, crf)
-        console.print(
+        run.tell(
             f"  {row['rung']}: {row['sender_ms']:.0f} ms, {row['bits_per_frame'] / 1e3:.0f} kbit, "
             f"{row['psnr_db']:.2f} dB"
         )
         return [row]
 
-    (row,) = store.rows(contender.key(rung, crf), make)
+    (row,) = run.store.rows(contender.key(rung, crf), make)
     return row
 
 
 def _tracking(
     measured: Sequence[tuple[tuple[Contender, Rung], Sequence[Row]]],
-    store: CellStore,
-    console: Console,
+    run: Run,
 ) -> list[TrackingRow]:
     """Measure every effort at each quality of each field, coded as its first rung is."""
     first: dict[tuple[str, Quality], tuple[Contender, Rung, Sequence[Row]]] = {}
@@ -313,7 +290,7 @@ def _tracking(
     return rows_of(
         TrackingRow,
         [
-            _tracking_row(*given, tracking, store, console)
+            _tracking_row(*given, tracking, run)
             for given in first.values()
             for tracking in TrackingEffort
         ],
@@ -325,28 +302,27 @@ def _tracking_row(
     rung: Rung,
     placed: Sequence[Row],
     tracking: TrackingEffort,
-    store: CellStore,
-    console: Console,
+    run: Run,
 ) -> Row:
     def make() -> list[Row]:
         row = contender.tracked(rung, tracking, placed)
         took = "lost" if row.get("track_ms") is None else f"{row['track_ms']:.1f} ms"
         kind, quality = contender.field.metadata.kind, quality_name(rung.quality)
-        console.print(f"  {kind} {quality} track-{tracking}: {took}")
+        run.tell(f"  {kind} {quality} track-{tracking}: {took}")
         return [row]
 
     name = replace(rung, tracking=tracking).name
     key = {**contender.key(rung, 0.0), "verb": "ladder-tracking", "rung": f"{name} {tracking}"}
-    (row,) = store.rows(key, make)
+    (row,) = run.store.rows(key, make)
     return row
 
 
-def _say_cost(contenders: Sequence[Contender], store: CellStore, console: Console) -> None:
+def _say_cost(contenders: Sequence[Contender], run: Run) -> None:
     """Time the full rung of each field on a few frames."""
     cells, left, seconds = 0, 0, 0.0
     for contender in contenders:
         keys = [contender.key(rung, crf) for rung in contender.rungs for crf in CRFS]
-        missing = sum(not store.has(key) for key in keys)
+        missing = sum(not run.store.has(key) for key in keys)
         cells, left = cells + len(keys), left + missing
         if missing:
             probe = contender.drive.first(PROBE_FRAMES)
@@ -359,4 +335,4 @@ def _say_cost(contenders: Sequence[Contender], store: CellStore, console: Consol
             qualities = len({rung.quality for rung in contender.rungs})
             seconds += per_frame * qualities * (rendered_s - began_s)
             seconds += per_frame * missing * (monotonic() - rendered_s)
-    console.print(f"{cells} rungs to measure, {left} of them left: at most {seconds / 60:.1f} min")
+    run.tell(f"{cells} rungs to measure, {left} of them left: at most {seconds / 60:.1f} min")

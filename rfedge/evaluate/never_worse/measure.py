@@ -1,58 +1,49 @@
-"""Never worse than plain x264: with the right field, one of another street, and none at all.
+"""Measure that no field makes a stream worse than plain x264: the right one, a wrong one, none.
 
-At 31, 33 and 35 dB a frame may cost at most 2 % more than x264 with low delay,
-its header apart. Two controls make the field useless: ``wrong-street`` is the field seen a quarter
-turn to the left, depth and picture alike, and ``black`` is a black picture at depth 0. Both ends
-predict from them; the sender must notice by itself that they are of no use.
+At 31, 33 and 35 dB a frame may cost at most 2 % more than x264 with low delay, without its header.
+Two controls make the field useless: ``wrong-street`` is the field seen a quarter turn to the left,
+depth and picture alike, and ``black`` is a black picture at depth 0. Both ends predict from them;
+the sender must notice by itself that they are of no use.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 from rfcore.camera import Camera, Pose
-from rfcore.codec.h264.config import check_effort
-from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
 from rfcore.views import FieldView
-from rfedge.evaluate.cells import CellStore, program_version
 from rfedge.evaluate.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, RenderedClip, render_clip
+from rfedge.evaluate.never_worse import EvalNeverWorse
 from rfedge.evaluate.performance import Performance, perform, seconds_left
 from rfedge.evaluate.rivals import x264_for_psnr, x264_lowdelay
-from rfedge.report.tables import heading, print_table, table
-from rfedge.results import (
-    Result,
-    check_result_path,
-    make_result,
-    provenance,
-    rows_of,
-    write_result,
-)
+from rfedge.evaluate.runner import Run, program_version
+from rfedge.jobs import CellStore
+from rfedge.report.tables import Column, Table, columns, shown
+from rfedge.results import Result, rows_of
 
 __all__ = [
     "ALLOWED_PERCENT",
     "AT_DB",
     "CONTROLS",
     "NeverWorse",
-    "NeverWorseJob",
     "NeverWorseRow",
     "controls_of",
-    "never_worse_section",
-    "print_never_worse",
+    "never_worse_parts",
     "run_never_worse",
 ]
 
 
 AT_DB = (31.0, 33.0, 35.0)
 ALLOWED_PERCENT = 2.0
+QUICK_FRAMES = 6
 CONTROLS = ("right", "wrong-street", "black")
 POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
 """Wide, since x264 takes a lower quantiser at the same CRF the fewer frames a second there are."""
@@ -63,34 +54,37 @@ BLACK_YUV = (16, 128, 128)
 
 @dataclass(frozen=True)
 class NeverWorseRow:
-    """One drive with one field, right or wrong, at one quality. CPU is the sender's, a frame."""
+    """One drive with one field, right or wrong, at one quality.
+
+    Bytes are means over all frames but the first, of whole messages with their header. Processor
+    times are the sender's, a frame.
+    """
 
     scene: str
     hz: float
     frames: int
-    control: str
-    """Which field both ends hold."""
+    control: str = field(metadata=shown("field"))
+    """The field that both ends hold."""
     preset: str
-    at_db: float
-    bytes: float
-    """Of a whole message, header included, as all bytes here a mean over all frames but one."""
-    header_bytes: float
-    rival_bytes: float
-    excess_percent: float
-    """Bytes without the header over those of x264 at the same quality."""
-    excess_percent_psnr_tuned: float
+    at_db: float = field(metadata=shown("dB", "g"))
+    bytes: float = field(metadata=shown("bytes", ".0f"))
+    header_bytes: float = field(metadata=shown("header bytes", ".0f"))
+    rival_bytes: float = field(metadata=shown("x264 bytes", ".0f"))
+    excess_percent: float = field(metadata=shown("excess %", "+.1f"))
+    """Bytes without the header above those of x264 at the same quality."""
+    excess_percent_psnr_tuned: float = field(metadata=shown("over x264 tuned for PSNR, %", "+.1f"))
     """The same against x264 tuned for PSNR."""
     holds: bool
     first_frame_bytes: int
     rival_first_frame_bytes: int
-    references: str
+    references: str = field(metadata=shown("mostly predicted from"))
     """What most frames were predicted from."""
     cpu_ms: float
     rival_cpu_ms: float
 
 
 def controls_of(field: RadianceField, drive: Drive) -> Mapping[str, RenderedClip]:
-    """Return what both ends believe to see along ``drive``, by the names in ``CONTROLS``."""
+    """Return what both ends render along ``drive``, by the names in ``CONTROLS``."""
     right = render_clip(field, drive.cameras)
     turned = [
         Camera(camera.intrinsics, camera.world_from_cam.compose(QUARTER_TURN))
@@ -118,7 +112,7 @@ def _black_view(view: FieldView) -> FieldView:
 
 @dataclass(frozen=True)
 class NeverWorse:
-    """One drive under all controls; ``program`` names what codes."""
+    """One drive under all controls; ``program`` is the version of the code."""
 
     drive: Drive
     rendered: Mapping[str, RenderedClip]
@@ -128,12 +122,12 @@ class NeverWorse:
 
     @property
     def clip(self) -> Clip:
-        """What every coder gets; the field's own quality is not of interest here."""
+        """The clip that every coder gets, without the field's own quality."""
         return self.drive.clip()
 
     @property
     def coders(self) -> dict[str, ClipCoder]:
-        """Ours by control, then the anchors."""
+        """Our coder under each control, then the anchors."""
         ours: dict[str, ClipCoder] = {
             control: FieldCoder(
                 rendered,
@@ -198,116 +192,47 @@ class NeverWorse:
         )
 
 
-QUICK_FRAMES = 6
-
-
-@dataclass(frozen=True)
-class NeverWorseJob:
-    """What to run; see ``rfedge eval never-worse --help``."""
-
-    field: Path
-    drives: Sequence[str]
-    decimated: Sequence[str]
-    effort: str
-    preset: str
-    out: Path
-    cells: Path
-    quick: bool = False
-    retime: bool = False
-
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-        check_effort("effort", self.effort)
-        if not (self.drives or self.decimated):
-            raise InvalidInput("drives", "there is none")
-
-
-def run_never_worse(job: NeverWorseJob, console: Console) -> dict[str, Any]:
-    """Code what is not there yet, write ``job.out`` and print the rows.
+def run_never_worse(job: EvalNeverWorse, console: Console) -> dict[str, Any]:
+    """Code what is not there yet, write the result and print its rows.
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong.
     """
     for text in (*job.drives, *job.decimated):
         DriveName.parse(text)
-    field, made = load_field(job.field), provenance([job.field])
-    store = CellStore(job.cells)
-    tables = [
+    run, field = Run.begin("never-worse", job, [job.field], console), load_field(job.field)
+    drives = [
         NeverWorse(drive, controls_of(field, drive), job.effort, job.preset, program_version())
         for drive in _drives(job)
     ]
-    left_s = sum(seconds_left(table.clip, table.coders.values(), store) for table in tables)
-    console.print(f"{len(tables)} drives, about {left_s / 60:.1f} minutes left to do")
-    rows = [row for table in tables for row in table.rows(store, retime=job.retime)]
-    frames = {f"{t.drive.name.scene}@{t.drive.name.rate_hz:g}": t.drive.digest for t in tables}
-    content = {"quick": job.quick, "field_id": field.field_id, "frames": frames, "rows": rows}
-    result = make_result("never-worse", made, content)
-    write_result(job.out, result)
-    print_never_worse(console, rows)
-    return result
+    left_s = sum(seconds_left(each.clip, each.coders.values(), run.store) for each in drives)
+    run.tell(f"{len(drives)} drives, about {left_s / 60:.1f} minutes left to do")
+    rows = [row for each in drives for row in each.rows(run.store, retime=job.retime)]
+    frames = {f"{d.drive.name.scene}@{d.drive.name.rate_hz:g}": d.drive.digest for d in drives}
+    content = {"field_id": field.field_id, "frames": frames, "rows": rows}
+    return run.finish(content, never_worse_parts)
 
 
-def _drives(job: NeverWorseJob) -> list[Drive]:
+def _drives(job: EvalNeverWorse) -> list[Drive]:
     limit = QUICK_FRAMES if job.quick else None
     slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
     return [*slow, *(read_drive(text, limit) for text in job.drives)]
 
 
-COLUMNS = (
-    "scene",
-    "Hz",
-    "field",
-    "dB",
-    "bytes",
-    "of them header",
-    "x264",
-    "excess without header %",
-    "against x264 tuned for PSNR %",
-    "at most 2 %",
-    "mostly predicted from",
-    "CPU ms",
-    "x264's",
+DRIVE = Column("drive", lambda row: f"{row.scene}, {row.hz:g} Hz")
+HOLDS = Column("at most 2 %", lambda row: "yes" if row.holds else "NO")
+CPU = Column(
+    "sender ms: ours / x264", lambda row: (row.cpu_ms, row.rival_cpu_ms), "{:.0f} / {:.0f}"
 )
 
-PRINTED = ("scene", "Hz", "field", "dB", "excess %", "psnr-tuned", "holds", "references")
 
-
-def never_worse_section(path: Path, result: Result) -> str:
-    """Return the table; a field that made it worse stands out."""
-    rows = map(_cells, rows_of(NeverWorseRow, result["rows"]))
-    return "\n\n".join([heading(path, result), table(COLUMNS, rows), ""])
-
-
-def print_never_worse(console: Console, rows: Sequence[NeverWorseRow]) -> None:
-    """Print the verdict on each field at each quality."""
-    print_table(console, "A field against none", PRINTED, [_printed_cells(row) for row in rows])
-
-
-def _printed_cells(row: NeverWorseRow) -> list[str]:
-    return [
-        row.scene,
-        f"{row.hz:g}",
-        row.control,
-        f"{row.at_db:g}",
-        f"{row.excess_percent:.1f}",
-        f"{row.excess_percent_psnr_tuned:.1f}",
-        "yes" if row.holds else "NO",
-        row.references,
-    ]
-
-
-def _cells(row: NeverWorseRow) -> list[str]:
-    return [
-        row.scene,
-        f"{row.hz:g}",
-        row.control,
-        f"{row.at_db:g}",
-        f"{row.bytes:.0f}",
-        f"{row.header_bytes:.0f}",
-        f"{row.rival_bytes:.0f}",
-        f"{row.excess_percent:+.1f}",
-        f"{row.excess_percent_psnr_tuned:+.1f}",
-        "yes" if row.holds else "**no**",
-        row.references,
-        f"{row.cpu_ms:.0f}",
-        f"{row.rival_cpu_ms:.0f}",
-    ]
+def never_worse_parts(result: Result) -> Iterator[Table | str]:
+    """Yield the verdict on each field at each quality, then the bytes and times behind it."""
+    rows = rows_of(NeverWorseRow, result["rows"])
+    verdict = ("excess_percent", HOLDS, "excess_percent_psnr_tuned", "references")
+    yield Table(
+        "Bytes above those of x264 without the header",
+        columns(NeverWorseRow, DRIVE, "control", "at_db", *verdict),
+        rows,
+    )
+    sizes = ("bytes", "header_bytes", "rival_bytes", CPU)
+    yield Table("A frame", columns(NeverWorseRow, DRIVE, "control", "at_db", *sizes), rows)

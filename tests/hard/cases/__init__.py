@@ -1,6 +1,6 @@
 """Hard cases: inputs at the limits of arithmetic, each with what is right and how it is judged.
 
-A module a subject; ``case`` says what a case is, ``page`` makes ``docs/stability.md`` of a run.
+A module a subject; ``case`` says what a case is, ``page`` makes a result of a run.
 """
 
 from hard.cases import (

@@ -1,0 +1,308 @@
+"""The rows of a comparison's result, and the tables that show them.
+
+Bytes count the whole message of a frame, header included; savings and BD-rates are of all frames
+but the first. ``scene`` and ``hz`` name a drive in every kind of row. A method's name ends in the
+digest of the field that it predicts from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from rfedge.report.tables import Column, Table, columns, shown
+from rfedge.results import Result, rows_of
+
+__all__ = [
+    "BEST",
+    "BEST_OF_ANY_CPU",
+    "HEADLINE_ANCHOR",
+    "BitShareRow",
+    "BreakEvenRow",
+    "CompareRow",
+    "CurveRow",
+    "ForegroundRow",
+    "SsimRow",
+    "compare_parts",
+    "of_first_method",
+    "of_first_window",
+    "without_field",
+]
+
+BEST = "best-comparable"
+"""The family of the strongest rival that takes no more processor time than ours at both ends."""
+BEST_OF_ANY_CPU = "best-of-any-cpu"
+"""The family of the strongest of all rivals."""
+HEADLINE_ANCHOR = "x264-our-tools-medium"
+"""The rival that differs from our coder by the field alone, at a preset of its own time."""
+SAVING_AT_DB = ("31", "33", "35")
+
+
+@dataclass(frozen=True)
+class CompareRow:
+    """One method against one rival over one window of quality. ``cpu_ms`` is the sender's, a frame;
+    ``both_ends_ms`` sender's and receiver's: median, least and most of interleaved rounds."""
+
+    scene: str
+    hz: float
+    method: str
+    rival: str = field(metadata=shown("rival"))
+    """The family of settings, such as ``x264-lowdelay``."""
+    rival_setting: str = field(metadata=shown("setting"))
+    """The setting that stands for its family."""
+    window_db: Sequence[float] = field(metadata=shown("window dB", "{:g}..{:g}"))
+    """Lowest and highest luma PSNR."""
+    bd_rate_percent: float = field(metadata=shown("BD-rate %", "+.1f"))
+    """Negative if the method needs fewer bytes."""
+    ci95: Sequence[float] = field(metadata=shown("95 %", "{:.1f}..{:.1f}"))
+    """Interval of the BD-rate from blocks of frames drawn with replacement."""
+    points: int
+    saving_percent_at_db: Mapping[str, float]
+    """Saving by luma PSNR; a quality that a curve does not reach is left out."""
+    first_frame_bytes: int
+    rival_first_frame_bytes: int
+    ssim: float
+    rival_ssim: float
+    psnr_deviation_db: float
+    rival_psnr_deviation_db: float
+    cpu_ms: float
+    rival_cpu_ms: float
+    both_ends_ms: Sequence[float] = field(metadata=shown("both ends ms", "{:.0f} ({:.0f}..{:.0f})"))
+    rival_both_ends_ms: Sequence[float] = field(
+        metadata=shown("the rival's", "{:.0f} ({:.0f}..{:.0f})")
+    )
+    field_psnr_db: float | None = field(metadata=shown("field dB", ".2f"))
+    """Quality of the field's own renders against the camera."""
+
+
+SAVINGS = Column(
+    "saving at 31 / 33 / 35 dB, %",
+    lambda row: " / ".join(
+        f"{row.saving_percent_at_db[db]:.0f}" if db in row.saving_percent_at_db else "-"
+        for db in SAVING_AT_DB
+    ),
+)
+SSIM = Column("SSIM", lambda row: (row.ssim, row.rival_ssim), "{:.3f} / {:.3f}")
+FIRST_FRAME = Column(
+    "first frame kB",
+    lambda row: (row.first_frame_bytes / 1e3, row.rival_first_frame_bytes / 1e3),
+    "{:.1f} / {:.1f}",
+)
+DEVIATION = Column(
+    "deviation dB",
+    lambda row: (row.psnr_deviation_db, row.rival_psnr_deviation_db),
+    "{:.2f} / {:.2f}",
+)
+SENDER = Column("sender ms", lambda row: (row.cpu_ms, row.rival_cpu_ms), "{:.0f} / {:.0f}")
+BOTH_ENDS = Column(
+    "ms at both ends",
+    lambda row: (row.both_ends_ms[0], row.rival_both_ends_ms[0]),
+    "{:.0f} / {:.0f}",
+)
+
+
+@dataclass(frozen=True)
+class SsimRow:
+    """One method against one rival that is tuned for SSIM, over a window of mean SSIM."""
+
+    scene: str
+    hz: float
+    method: str
+    rival: str
+    rival_setting: str = field(metadata=shown("rival"))
+    window_ssim: Sequence[float] = field(metadata=shown("window of SSIM", "{:g}..{:g}"))
+    bd_rate_percent: float = field(metadata=shown("BD-rate %", "+.1f"))
+
+
+@dataclass(frozen=True)
+class BreakEvenRow:
+    """What the field's own bytes leave of the saving when a drive is driven again and again."""
+
+    scene: str
+    hz: float
+    method: str
+    rival: str
+    at_db: float
+    frames_per_pass: int
+    field_bytes: int
+    saved_bytes_per_pass: float
+    passes_to_break_even: int | None = field(
+        metadata=shown("passes to break even", "d", missing="never")
+    )
+    saving_percent_after: Mapping[str, float]
+    """Saving by the number of passes."""
+
+
+@dataclass(frozen=True)
+class BitShareRow:
+    """How much of the picture, and of the bytes, one kind of macroblock takes at one CRF."""
+
+    scene: str
+    hz: float
+    method: str
+    crf: float
+    shows: str = field(metadata=shown("macroblocks"))
+    area_percent: float = field(metadata=shown("of the picture, %", ".0f"))
+    slice_percent: float = field(metadata=shown("of the bytes, %", ".0f"))
+    bytes_per_frame: float = field(metadata=shown("bytes a frame", ".0f"))
+
+
+@dataclass(frozen=True)
+class ForegroundRow:
+    """Ours, the whole picture, against a rival that sends the foreground alone."""
+
+    scene: str
+    hz: float
+    mask: str
+    foreground_percent: float
+    window_db: Sequence[float] | None
+    bd_rate_percent: float | None
+    """None, as ``window_db``, if the curves share less than a decibel."""
+    whole_picture_ceiling_db: float
+    ours: Mapping[str, Sequence[float]]
+    rfdvc_style: Mapping[str, Sequence[float]]
+
+
+@dataclass(frozen=True)
+class CurveRow:
+    """The curve of one coder, from its lowest quality to its highest."""
+
+    scene: str
+    hz: float
+    family: str
+    """Family of the rival; empty for ours."""
+    setting: str
+    cpu_ms: float
+    both_ends_ms: float
+    point: Sequence[float]
+    psnr_db: Sequence[float]
+    bytes_per_frame: Sequence[float]
+    ssim: Sequence[float]
+
+
+Row = TypeVar("Row", bound=CompareRow | SsimRow | BreakEvenRow | BitShareRow)
+
+
+def compare_parts(result: Result) -> Iterator[Table | str]:
+    """Yield the tables of a comparison: a row a rival for each drive, then what else was measured.
+
+    Of methods and windows the first is shown against every rival, the others against one; the
+    result has all rows.
+    """
+    compared = rows_of(CompareRow, result["rows"])
+    yield from _compared_tables(compared)
+    break_even = of_first_method(rows_of(BreakEvenRow, result.get("break_even", ())))
+    if break_even:
+        yield Table("What the field's own bytes leave of the saving", _BREAK_EVEN, break_even)
+    by_ssim = rows_of(SsimRow, result.get("ssim", ()))
+    if by_ssim:
+        yield Table("By SSIM, against rivals tuned for it", [DRIVE, *columns(SsimRow)], by_ssim)
+    bits = rows_of(BitShareRow, result.get("bits", ()))
+    if bits:
+        yield Table("Where the bits go, near 33.5 dB", [DRIVE, *columns(BitShareRow)], bits)
+    yield from map(_foreground_line, rows_of(ForegroundRow, result.get("foreground", ())))
+
+
+def _compared_tables(compared: Sequence[CompareRow]) -> Iterator[Table | str]:
+    if not compared:
+        yield "No curves share a window."
+        return
+    first = of_first_window(compared)
+    window = "{:g}..{:g}".format(*compared[0].window_db)
+    ours = without_field(compared[0].method)
+    figures = ("rival", "rival_setting", "bd_rate_percent", "ci95")
+    against = columns(CompareRow, *figures, SAVINGS, BOTH_ENDS, SSIM, FIRST_FRAME)
+    for name, rows in _by_drive(of_first_method(first)).items():
+        yield Table(f"{name}: {ours} over {window} dB", against, rows)
+    anchor = _anchor(compared)
+    told = ("bd_rate_percent", "ci95")
+    methods = [row for row in first if row.rival == anchor]
+    yield Table(
+        f"By method, against {anchor} over {window} dB",
+        columns(CompareRow, DRIVE, METHOD, *told, SENDER, BOTH_ENDS, DEVIATION),
+        methods,
+    )
+    windows = [row for row in of_first_method(compared) if row.rival == anchor]
+    yield Table(
+        f"By window of luma PSNR, {ours} against {anchor}",
+        columns(CompareRow, DRIVE, "window_db", *told),
+        windows,
+    )
+    yield Table(
+        "Processor time a frame: median, least and most",
+        columns(CompareRow, DRIVE, "both_ends_ms", "rival_both_ends_ms", "field_psnr_db"),
+        of_first_method(methods),
+    )
+
+
+def _anchor(compared: Sequence[CompareRow]) -> str:
+    """Return the headline's rival, or the first of a comparison without it."""
+    rivals = [row.rival for row in compared]
+    return HEADLINE_ANCHOR if HEADLINE_ANCHOR in rivals else rivals[0]
+
+
+def without_field(method: str) -> str:
+    """Return a method's name without the digest of its field."""
+    return method.rsplit("-", 1)[0]
+
+
+def of_first_window(rows: Sequence[CompareRow]) -> list[CompareRow]:
+    """Return the rows of the window that was asked about first."""
+    return [row for row in rows if row.window_db == rows[0].window_db]
+
+
+def of_first_method(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of the method that stands first, whatever its field."""
+    return [row for row in rows if without_field(row.method) == without_field(rows[0].method)]
+
+
+def _by_drive(rows: Iterable[CompareRow]) -> dict[str, list[CompareRow]]:
+    """Return rows by drive, and by field if a drive was rendered with several."""
+    found: dict[str, list[CompareRow]] = {}
+    for row in rows:
+        found.setdefault(f"{_drive(row)}, field {_field(row)}", []).append(row)
+    drives = [name.partition(", field ")[0] for name in found]
+    return {
+        name if drives.count(drive) > 1 else drive: of_drive
+        for drive, (name, of_drive) in zip(drives, found.items(), strict=True)
+    }
+
+
+def _drive(row: Any) -> str:
+    return f"{row.scene}, {row.hz:g} Hz"
+
+
+def _field(row: Any) -> str:
+    return str(row.method.rsplit("-", 1)[-1])
+
+
+DRIVE = Column("drive", _drive)
+METHOD = Column("method", lambda row: without_field(row.method))
+_BREAK_EVEN = [
+    DRIVE,
+    Column("field", _field),
+    Column("saved kB a pass", lambda row: row.saved_bytes_per_pass / 1e3, ".1f"),
+    Column("field MB", lambda row: row.field_bytes / 1e6, ".2f"),
+    *columns(BreakEvenRow, "passes_to_break_even"),
+    Column(
+        "saving after 1 / 10 / 100 passes, %",
+        lambda row: " / ".join(f"{saving:.0f}" for saving in row.saving_percent_after.values()),
+    ),
+]
+
+
+def _foreground_line(row: ForegroundRow) -> str:
+    if row.bd_rate_percent is None or row.window_db is None:
+        against = "they share no window of a decibel"
+    else:
+        low, high = row.window_db
+        against = (
+            f"ours, the whole picture, has a BD-rate of {row.bd_rate_percent:+.0f} % at equal "
+            f"quality of the foreground ({low:.1f}..{high:.1f} dB)"
+        )
+    return (
+        f"Foreground only, in the style of RFDVC, {_drive(row)} ({row.foreground_percent:.0f} % of "
+        f"the pixels; {row.mask}): the whole picture never passes "
+        f"{row.whole_picture_ceiling_db:.2f} dB; {against}."
+    )

@@ -1,0 +1,142 @@
+"""How every experiment runs: what is finished is taken from disk, what is measured is recorded.
+
+A ``Run`` is made before anything is measured, so that the result says of which revision it is. It
+hands out finished pieces (``store``), has pieces measured in several processes or on Ray
+(``parallel``), and writes the result and prints its tables at the end (``finish``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from rfedge.evaluate import Experiment
+from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip
+from rfedge.jobs import Cell, CellKey, CellStore, Job, run_jobs
+from rfedge.report.tables import Parts, Table
+from rfedge.results import CHECKOUT, Provenance, make_result, provenance, write_result
+
+__all__ = ["Run", "clip_key", "coded_clip", "program_version"]
+
+PROGRAM = ("rfcore", "rfedge/evaluate", "rfedge/offline.py")
+"""Code that a finished piece depends on."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of an experiment, from before it measures until its result is written."""
+
+    kind: str
+    job: Experiment
+    made: Provenance
+    store: CellStore
+    console: Console
+
+    @staticmethod
+    def begin(kind: str, job: Experiment, inputs: Iterable[Path], console: Console) -> Run:
+        """Begin a run that reads the files ``inputs``."""
+        return Run(kind, job, provenance(inputs), CellStore(job.cells), console)
+
+    def tell(self, text: str) -> None:
+        """Print a line about how the run goes."""
+        self.console.print(text, markup=False, highlight=False)
+
+    def parallel(self, jobs: Sequence[Job], processes: int, ray: str | None = None) -> None:
+        """Do jobs that leave finished pieces; without several processes or Ray, do nothing.
+
+        What they would leave is then measured where it is asked for.
+        """
+        if processes > 1 or ray is not None:
+            run_jobs(jobs, partial(print, flush=True), ray, processes)
+
+    def finish(self, content: Mapping[str, Any], parts: Parts) -> dict[str, Any]:
+        """Write the result, print the tables among its ``parts``, and return the result."""
+        result = make_result(self.kind, self.made, {"quick": self.job.quick, **content})
+        write_result(self.job.out, result)
+        for part in parts(result):
+            if isinstance(part, Table):
+                part.print(self.console)
+        return result
+
+
+@cache
+def program_version(root: Path = CHECKOUT) -> str:
+    """Return the digest of the modules and kernels that a finished piece depends on.
+
+    A revision would do only in a clean checkout: it keeps its name when files change.
+    """
+    total = hashlib.sha256()
+    for path in sorted(_program_files(root)):
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        total.update(f"{path.relative_to(root)} {content}\n".encode())
+    return f"program {total.hexdigest()[:16]}"
+
+
+def _program_files(root: Path) -> Iterator[Path]:
+    for name in PROGRAM:
+        path = root / name
+        if path.is_file():
+            yield path
+        else:
+            for pattern in ("*.py", "*.so"):
+                yield from path.rglob(pattern)
+
+
+def clip_key(clip: Clip, coder: ClipCoder, point: float) -> CellKey:
+    """Return the key of ``clip`` coded by ``coder`` at ``point``."""
+    return {
+        "scene": clip.scene,
+        "hz": clip.rate_hz,
+        "frames": clip.frames_digest,
+        "method": coder.name,
+        "point": point,
+        "version": coder.version,
+    }
+
+
+def coded_clip(clip: Clip, coder: ClipCoder, point: float, store: CellStore) -> CodedClip:
+    """Return ``clip`` coded at ``point``, from ``store`` or coded now and then kept.
+
+    Raises ``InvalidData`` naming the file if a stored cell is damaged.
+    """
+    cell = store.cell(clip_key(clip, coder, point))
+    if cell.path.exists():
+        return _clip_of(cell)
+    coded = coder.code(clip.frames, clip.rate_hz, point)
+    cell.keep(_fields(coded))
+    return coded
+
+
+def _fields(coded: CodedClip) -> dict[str, Any]:
+    return {
+        "point": coded.point,
+        "frame_bytes": coded.frame_bytes.tolist(),
+        "luma_mse": coded.luma_mse.tolist(),
+        "ssim": coded.ssim.tolist(),
+        "cpu_ms": coded.cpu_ms,
+        "notes": {name: list(values) for name, values in coded.notes.items()},
+        "receiver_cpu_ms": coded.receiver_cpu_ms,
+    }
+
+
+def _clip_of(cell: Cell) -> CodedClip:
+    stored = cell.result()
+    try:
+        return CodedClip(
+            stored["point"],
+            np.array(stored["frame_bytes"], np.int64),
+            np.array(stored["luma_mse"], np.float64),
+            np.array(stored["ssim"], np.float64),
+            stored["cpu_ms"],
+            {name: tuple(values) for name, values in stored["notes"].items()},
+            stored["receiver_cpu_ms"],
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise cell.damaged(error) from error

@@ -1,0 +1,99 @@
+"""Every recorded result renders, in tables that fit a screen."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lab.pages.__main__ import (
+    KINDS,
+    README_BEGINS,
+    README_ENDS,
+    Recorded,
+    pages,
+    recorded,
+    with_headline,
+    write_figures,
+)
+from lab.pages.suites import FAULTS, RESULTS, FaultRow
+from rfcore.errors import InvalidInput
+from rfedge.report.tables import PAGE_COLUMNS
+from rfedge.results import as_json
+
+
+@pytest.fixture(scope="module")
+def results() -> Recorded:
+    return recorded()
+
+
+@pytest.fixture(scope="module")
+def drawn(results: Recorded, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
+    return write_figures(results, tmp_path_factory.mktemp("figures"))
+
+
+def test_every_recorded_result_renders_in_tables_that_fit_a_screen(
+    results: Recorded, drawn: dict[str, list[Path]]
+) -> None:
+    made = pages(results, drawn)
+    for kind, named in results.items():
+        page = made[kind]
+        assert page.startswith(f"# {KINDS[kind].title}\n\n{KINDS[kind].shows}\n")
+        for name, result in named:
+            assert f"\n## {name}\n" in page
+            assert result["command"] in page
+        widths = {
+            len(re.split(r"(?<!\\)\|", line)) - 2 for line in page.splitlines() if line[:1] == "|"
+        }
+        assert max(widths, default=1) <= PAGE_COLUMNS, kind
+    assert set(made) == {*KINDS, "index"} - {"soak"}, "each kind has a page and a line of the index"
+
+
+def test_every_figure_that_a_page_shows_is_committed(
+    results: Recorded, drawn: dict[str, list[Path]]
+) -> None:
+    for page in pages(results, drawn).values():
+        for name in re.findall(r"\]\(figures/(.*?)\)", page):
+            assert (RESULTS / "figures" / name).is_file(), name
+
+
+def test_the_numbers_beside_the_committed_figures_are_those_of_the_results(
+    drawn: dict[str, list[Path]],
+) -> None:
+    for path in (path for files in drawn.values() for path in files if path.suffix == ".csv"):
+        committed = RESULTS / "figures" / path.name
+        assert committed.read_text() == path.read_text(), "run `make figures`"
+
+
+def test_the_readme_gets_three_drives_and_the_loss_between_its_marks(results: Recorded) -> None:
+    page = with_headline(f"before\n{README_BEGINS}\nold\n{README_ENDS}\nafter\n", results)
+    assert page.startswith(f"before\n{README_BEGINS}\n")
+    assert page.endswith(f"{README_ENDS}\nafter\n")
+    assert "old" not in page
+    assert len([line for line in page.splitlines() if line[:1] == "|"]) == 2 + 3
+    assert "in rain **" in page
+    with pytest.raises(InvalidInput, match="it lacks"):
+        with_headline("# A page\n", results)
+
+
+def test_a_kind_that_nothing_shows_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text(json.dumps({"kind": "weather"}))
+    with pytest.raises(InvalidInput, match=r"x\.json: nothing shows kind 'weather'"):
+        recorded(tmp_path)
+
+
+ROW = FaultRow("it breaks", "a hammer", "back <= 1 s; told so", "2.5 s; yes", passed=False)
+
+
+def test_a_fault_that_does_not_hold_stands_out_with_each_bound_beside_its_figure() -> None:
+    score, *_, shown = FAULTS.parts({"rows": as_json([ROW])})
+    assert score == "0 of 1 hold."
+    assert "it breaks: **does not hold**" in shown
+    assert "| back <= 1 s | 2.5 s |\n| told so | yes |" in str(shown)
+
+
+def test_a_bound_without_its_figure_is_refused() -> None:
+    row: dict[str, Any] = {**as_json(ROW), "measured": "2.5 s"}
+    with pytest.raises(InvalidInput, match="2 bounds and 1 figures"):
+        list(FAULTS.parts({"rows": [row]}))
