@@ -1,8 +1,6 @@
 """A table gives what was written and nothing else; what is wrong is named by path and limit."""
 
-import json
 import math
-import tomllib
 from collections.abc import Callable
 from typing import Any
 
@@ -138,11 +136,6 @@ def test_a_wrong_value_is_named_with_its_limit(
     assert caught.value.field == field
 
 
-def test_only_a_lower_limit_is_named_as_one() -> None:
-    with pytest.raises(InvalidInput, match="is -1, must be at least 0"):
-        table({"key": -1}).number("key", Range(0.0))
-
-
 def test_a_default_stands_for_a_missing_key_and_is_checked_too() -> None:
     assert table({}).number("key", Range(0, 1), 0.5) == 0.5
     assert table({"key": 0.25}).number("key", Range(0, 1), 0.5) == 0.25
@@ -159,13 +152,6 @@ def test_a_key_that_nobody_asked_for_is_refused_with_those_that_are_known() -> N
     assert caught.value.field == "uplink.dleay"
 
 
-def test_a_table_within_a_table_knows_its_path() -> None:
-    inner = table({"uplink": {"outage": {"at": "x"}}}).table("uplink").table("outage")
-    with pytest.raises(InvalidInput, match="not a number") as caught:
-        inner.number("at")
-    assert caught.value.field == "uplink.outage.at"
-
-
 def test_the_error_is_what_the_format_makes_of_path_and_problem() -> None:
     def fail(path: str, problem: str) -> Exception:
         return LookupError(f"file.json at {path}, which {problem}")
@@ -174,16 +160,6 @@ def test_the_error_is_what_the_format_makes_of_path_and_problem() -> None:
         Table({}, fail).value("a")
     with pytest.raises(LookupError, match=r"file\.json at , which is 3, not a table"):
         Table(3, fail)
-
-
-@given(st.dictionaries(st.text("abc", min_size=1, max_size=3), st.integers(-(2**62), 2**62)))
-def test_toml_and_json_of_the_same_values_are_the_same_tables(values: dict[str, int]) -> None:
-    lines = "\n".join(f"{key} = {value}" for key, value in values.items())
-    tables = [table(tomllib.loads(lines)), table(json.loads(json.dumps(values)))]
-    for key, value in values.items():
-        assert [one.whole(key) for one in tables] == [value, value]
-    for one in tables:
-        one.finish()
 
 
 @given(json_values)

@@ -294,11 +294,6 @@ def test_a_fault_is_named_in_one_line(
     assert after == before, "nothing is written"
 
 
-def test_every_format_has_its_faults(golden: Any) -> None:
-    for name in golden.FORMATS:
-        assert sum(row[0] == name for rows in FAULTS.values() for row in rows) >= 8, name
-
-
 def test_a_picture_outside_the_trajectory_is_left_out_when_that_is_declared(
     golden: Any, tmp_path: Path
 ) -> None:

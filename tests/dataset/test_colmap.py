@@ -77,17 +77,6 @@ def ordered(points: np.ndarray) -> np.ndarray:
     return points[np.lexsort(points.T)]
 
 
-def test_a_lens_of_a_model_is_taken_out_when_that_is_chosen(golden: Any, tmp_path: Path) -> None:
-    folder = golden.write("colmap_text", tmp_path)
-    cameras = folder / "sparse" / "0" / "cameras.txt"
-    cameras.write_text("7 OPENCV 64 48 50 52 32 24 -0.05 0.01 0.001 0\n")
-    with pytest.raises(DatasetError, match=r"images\.txt: line 2 .*BrownLens.*undistort"):
-        read_dataset(folder)
-    dataset = read_dataset(folder, distortion="undistort")
-    assert dataset.undistorted == 3
-    assert dataset.pictures[0].read().shape == (48, 64, 3)
-
-
 @pytest.mark.parametrize("cut", [4, 20, 60, 100])
 def test_a_binary_file_cut_short_is_refused(golden: Any, tmp_path: Path, cut: int) -> None:
     folder = golden.write("colmap_binary", tmp_path)

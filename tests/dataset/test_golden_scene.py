@@ -7,21 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rfcore.camera import Camera, TileOrigin
+from dataset.conftest import GoldenScene
+from rfcore.camera import TileOrigin
 from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError
 
-FORMATS = ("transforms", "colmap_text", "colmap_binary", "kitti", "inria", "folder", "video")
 TIMED = ("transforms", "kitti", "folder", "video")
 
 
-@pytest.fixture(params=FORMATS)
+@pytest.fixture(params=GoldenScene.FORMATS)
 def format_name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
-
-
-def test_every_format_is_tested(golden: Any) -> None:
-    assert golden.FORMATS == FORMATS
 
 
 def test_the_point_lands_on_its_pixel(golden: Any, format_name: str, tmp_path: Path) -> None:
@@ -30,18 +26,6 @@ def test_the_point_lands_on_its_pixel(golden: Any, format_name: str, tmp_path: P
     for picture, expected in zip(dataset.pictures, golden.pixels(), strict=True):
         u_px, v_px, _ = picture.camera.project(golden.point)
         assert (u_px, v_px) == pytest.approx(expected, abs=1e-9)
-
-
-def test_the_pixel_and_its_depth_lead_back(golden: Any, format_name: str, tmp_path: Path) -> None:
-    for picture in read_dataset(golden.write(format_name, tmp_path / "d")).pictures:
-        u_px, v_px, depth_m = picture.camera.project(golden.point)
-        assert unprojected(picture.camera, u_px, v_px, depth_m) == pytest.approx(golden.point)
-
-
-def unprojected(camera: Camera, u: float, v: float, depth_m: float) -> tuple[float, float, float]:
-    k = camera.intrinsics
-    x, y = (u - k.cx_px) / k.fx_px * depth_m, (v - k.cy_px) / k.fy_px * depth_m
-    return camera.world_from_cam.apply((x, y, depth_m))
 
 
 def test_the_pixel_of_the_point_is_white(golden: Any, format_name: str, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The committed sample is whole, small enough, and its poses fit its pictures."""
+"""The committed sample is whole, and its poses fit its pictures."""
 
 from pathlib import Path
 
@@ -16,23 +16,6 @@ pytestmark = pytest.mark.sample
 
 def test_every_file_is_as_it_was_listed() -> None:
     verify_manifest(SAMPLE)
-    size_bytes = sum(path.stat().st_size for path in SAMPLE.rglob("*") if path.is_file())
-    assert size_bytes <= 24_000_000
-
-
-def test_the_training_views_come_with_points() -> None:
-    train = read_dataset(SAMPLE / "transforms_train.json")
-    assert len(train.pictures) == 120
-    assert train.points is not None
-    assert len(train.points.xyz_m) == 120_000
-
-
-@pytest.mark.parametrize("name", ["empty", "vehicles"])
-def test_a_drive_is_24_pictures_at_10_hz(name: str) -> None:
-    drive = read_dataset(SAMPLE / f"transforms_drive_{name}.json")
-    assert len(drive.pictures) == 24
-    assert drive.rate_hz == pytest.approx(10.0)
-    assert drive.pictures[-1].read().shape == (360, 640, 3)
 
 
 def test_the_two_drives_take_the_same_path() -> None:

@@ -61,11 +61,8 @@ def test_csv_columns_come_in_any_order(tmp_path: Path) -> None:
     ("name", "text", "named"),
     [
         ("t.txt", "", "holds no poses"),
-        ("t.txt", "1 0 0 0 0 0 0\n", r"line 1: has 7 values, TUM has 8"),
         ("t.txt", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: time 1.0* s does not come after"),
         ("t.txt", "1 0 0 0 0 0 0 1\n.5 0 0 0 0 0 0 1\n", "line 2: time 0.50* s does not come"),
-        ("t.txt", "1 0 0 nan 0 0 0 1\n", "line 1: nan is not a finite"),
-        ("t.txt", "1 0 0 0 0 0 0 2\n", "line 1: quaternion .* has norm 2"),
         ("t.txt", "-1 0 0 0 0 0 0 1\n", "line 1: time -1 must be"),
         ("t.txt", "inf 0 0 0 0 0 0 1\n", "line 1: time inf must be"),
         ("t.txt", "now 0 0 0 0 0 0 1\n", "line 1: 'now' is not a time"),
@@ -80,8 +77,3 @@ def test_what_is_wrong_is_named(tmp_path: Path, name: str, text: str | bytes, na
     (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(DatasetError, match=rf"{name}: {named}"):
         read_trajectory(tmp_path / name)
-
-
-def test_a_missing_trajectory_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"t\.txt: cannot be read"):
-        read_trajectory(tmp_path / "t.txt")

@@ -12,17 +12,9 @@ from rfcore.camera import TileOrigin
 from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field.ply_table import write_vertices
-from rfcore.image import write_png
 
 Content = dict[str, Any]
 Write = Callable[..., Path]
-
-
-def test_a_known_point_lands_on_the_known_pixel(write: Write, content: Content) -> None:
-    """OpenGL looks along -z with y up: (1, 1, -4) is right of and above the middle."""
-    first, second = read_dataset(write(content)).pictures
-    assert first.camera.project((1, 1, -4)) == pytest.approx((4 + 10 / 4, 3 - 12 / 4, 4))
-    assert second.camera.project((3, 1, -4)) == pytest.approx((4 + 10 / 4, 3 - 12 / 4, 4))
 
 
 def test_a_rotated_camera_keeps_its_place_and_turns_its_axes(
@@ -116,7 +108,6 @@ def without(key: str) -> Callable[[Content], None]:
     return lambda content: content.pop(key)
 
 
-BAD_MATRIX = [[1, 0, 0, math.nan], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 MIRRORED = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
 FAR = [[1, 0, 0, 7e5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
@@ -132,7 +123,6 @@ FAR = [[1, 0, 0, 7e5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (top_change("w", 0), "intrinsics.width_px: 0 px"),
         (top_change("fl_x", "wide"), "'fl_x' is 'wide', not a number"),
         (top_change("cx", math.nan), "'cx' is nan"),
-        (top_change("camera_model", "EQUIRECTANGULAR"), "EQUIRECTANGULAR.*PINHOLE"),
         (top_change("k4", 0.01), "distortion k4 = 0.01 does not belong to camera_model OPENCV"),
         (top_change("ftheta_p0", 0.01), "'ftheta_p0' names a lens that is not read"),
         (top_change("k1", 0.01), "lens distortion BrownLens.*k1=0.01.*undistort"),
@@ -141,14 +131,9 @@ FAR = [[1, 0, 0, 7e5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (top_change("applied_transform", [[1]]), "'applied_transform' is .*, not 3x4 or 4x4"),
         (top_change("ply_file_path", "absent.ply"), "absent.ply"),
         (frame_change("file_path", 3), r"frames\[1\]: key 'file_path'"),
-        (frame_change("file_path", "absent.png"), r"frames\[1\] \(absent.png\): picture .*missing"),
         (frame_change("time", -1.0), "'time' is -1.0"),
-        (frame_change("transform_matrix", None), "'transform_matrix' is None, not 3x4 or 4x4"),
-        (frame_change("transform_matrix", BAD_MATRIX), r"transform_matrix\[0\]\[3\]' is nan"),
         (frame_change("transform_matrix", MIRRORED), "left-handed"),
         (frame_change("transform_matrix", FAR), "350000 m from the tile's origin.*tile_origin"),
-        (frame_change("file_path", "../a.png"), r"'\.\./a.png' leaves the dataset"),
-        (frame_change("file_path", "/a.png"), "'/a.png' leaves the dataset"),
         (top_change("ply_file_path", "../points.ply"), "points.ply' leaves the dataset"),
     ],
 )
@@ -165,13 +150,6 @@ def test_what_is_wrong_is_named(
 def test_a_distortion_of_zero_is_no_distortion(write: Write, content: Content) -> None:
     content |= {"k1": 0.0, "k2": 0, "p1": 0.0}
     assert len(read_dataset(write(content)).pictures) == 2
-
-
-def test_a_picture_of_another_size_is_refused(write: Write, content: Content) -> None:
-    file = write(content)
-    write_png(file.parent / "b.png", np.zeros((7, 8, 3), np.uint8))
-    with pytest.raises(DatasetError, match=r"b.png: picture is 8x7 px, its camera says 8x6"):
-        read_dataset(file)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3"])
@@ -225,21 +203,6 @@ def write_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
     columns = [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
     rows = [(*p, *c) for p, c in zip(xyz.tolist(), rgb.tolist(), strict=True)]
     write_vertices(path, np.array(rows, columns))
-
-
-def test_a_far_world_gets_an_origin_of_whole_metres(write: Write, content: Content) -> None:
-    for frame in content["frames"]:
-        frame["transform_matrix"][0][3] += 691_607.75
-        frame["transform_matrix"][1][3] += 5_334_760.25
-    dataset = read_dataset(write(content))
-    assert dataset.tile_origin == TileOrigin(691_609.0, 5_334_760.0, 0.0)
-    assert dataset.pictures[0].camera.world_from_cam.translation_m == (-1.25, 0.25, 0.0)
-
-
-def test_time_that_goes_back_is_refused(write: Write, content: Content) -> None:
-    content["frames"][0]["time"] = 0.2
-    with pytest.raises(DatasetError, match=r"frames\[1\] \(b.png\): time 0.1 s comes after 0.2 s"):
-        read_dataset(write(content))
 
 
 def test_a_lens_is_taken_out_only_when_that_is_chosen(write: Write, content: Content) -> None:

@@ -17,7 +17,6 @@ from rfcore.link.shaper import ConstantRate, LinkParts
 from rfcore.link.traces import CapacityTrace, DelayTrace, read_cicv5g
 
 SAMPLES = Path(__file__).parents[2] / "samples" / "links"
-RECORDED = Path(__file__).parents[3] / "shared" / "data" / "traces" / "cicv5g"
 
 PROFILE = LinkProfile(1e6, 0.02)
 MS = st.integers(0, 4_000).map(lambda ms: ms / 1e3)
@@ -177,12 +176,6 @@ def test_a_file_that_is_no_recording_is_refused(text: str, problem: str, tmp_pat
     (tmp_path / "d.txt").write_text(text)
     with pytest.raises(InvalidData, match=problem):
         read_cicv5g(tmp_path / "d.txt")
-
-
-@pytest.mark.parametrize("path", sorted(RECORDED.glob("*.txt")), ids=lambda path: path.name)
-def test_recorded_delays_are_read(path: Path) -> None:
-    trace = read_cicv5g(path)
-    assert 0.001 < sorted(trace.delays_s)[len(trace.delays_s) // 2] < 30.0
 
 
 def test_connections_live_as_long_as_they_should_on_average() -> None:

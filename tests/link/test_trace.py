@@ -13,7 +13,6 @@ from rfcore.link import Arrival, DirectionPlan, LinkProfile, delivery_times
 from rfcore.link.traces import CapacityTrace, TraceTransmission, read_mahimahi
 
 SAMPLES = Path(__file__).parents[2] / "samples" / "links"
-RECORDED = Path(__file__).parents[3] / "shared" / "data" / "traces" / "mahimahi"
 
 traces = (
     st.lists(st.integers(0, 300), min_size=1, max_size=30)
@@ -145,11 +144,3 @@ def test_the_sample_trace_has_the_rate_and_the_gaps_it_claims() -> None:
     gaps_ms = [b - a for a, b in itertools.pairwise(trace.times_ms)]
     assert max(gaps_ms) >= 600
     assert 1e6 < trace.mean_rate_bps < 4e6
-
-
-@pytest.mark.parametrize("path", sorted(RECORDED.glob("*")), ids=lambda path: path.name)
-def test_recorded_traces_are_read(path: Path) -> None:
-    trace = read_mahimahi(path)
-    assert 1e5 < trace.mean_rate_bps < 1e9
-    times = through(trace, [Arrival(i / 30, 4096) for i in range(300)])
-    assert times == sorted(times)

@@ -1,7 +1,8 @@
-"""Where a search looks: the prior first, then around it as far as the prior says."""
+"""Measurements are checked where they are made; a search looks at its prior, then around it."""
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,7 @@ from rfcore.localise.prior import (
     MOST_TURNS,
     PLAUSIBLE,
     REACH_DEG,
+    PoseMeasurement,
     PosePrior,
     hypotheses,
     moved,
@@ -82,3 +84,37 @@ def test_a_deviation_that_is_none_is_refused(bad: float) -> None:
         PosePrior(POSE, bad, 1.0)
     with pytest.raises(InvalidInput, match=r"prior.rotation_deg: .* must be finite and above 0"):
         PosePrior(POSE, 1.0, bad)
+
+
+GOOD: dict[str, Any] = {
+    "time_ns": 1,
+    "position_m": (1.0, 2.0, 3.0),
+    "position_std_m": (1.0, 1.0, 2.0),
+    "rotation": (1.0, 0.0, 0.0, 0.0),
+    "rotation_std_deg": 1.0,
+}
+
+
+def test_a_measurement_with_a_rotation_is_a_pose() -> None:
+    assert PoseMeasurement(**GOOD).world_from_cam == Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
+    assert PoseMeasurement(**{**GOOD, "rotation": None}).world_from_cam is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reported"),
+    [
+        ("time_ns", -1, "time_ns"),
+        ("time_ns", 1 << 64, "time_ns"),
+        ("position_m", (math.nan, 0.0, 0.0), "translation_m"),
+        ("position_m", (0.0, math.inf, 0.0), "translation_m"),
+        ("rotation", (2.0, 0.0, 0.0, 0.0), "rotation"),
+        ("rotation", (math.nan, 0.0, 0.0, 0.0), "rotation"),
+        ("position_std_m", (1.0, 0.0, 1.0), "position_std_m"),
+        ("position_std_m", (1.0, math.nan, 1.0), "position_std_m"),
+        ("rotation_std_deg", math.inf, "rotation_std_deg"),
+        ("rotation_std_deg", -1.0, "rotation_std_deg"),
+    ],
+)
+def test_what_no_sensor_can_mean_is_refused(name: str, value: object, reported: str) -> None:
+    with pytest.raises(InvalidInput, match=reported):
+        PoseMeasurement(**{**GOOD, name: value})

@@ -154,14 +154,6 @@ def test_an_exception_of_the_waiting_thread_cancels_colmaps_work() -> None:
     assert tokens[0].is_cancelled
 
 
-def test_a_call_of_colmap_returns_what_it_returns() -> None:
-    def work(a: int, *, b: int, cancellation_token: pycolmap.CancellationToken) -> int:
-        assert not cancellation_token.is_cancelled
-        return a - b
-
-    assert cancellable(work, 7, b=3) == 4
-
-
 def test_parameters_belong_to_their_model() -> None:
     with pytest.raises(InvalidInput, match="PINHOLE has 4, not 3"):
         PoseSettings(model="PINHOLE", parameters=(1.0, 2.0, 3.0))

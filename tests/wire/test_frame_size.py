@@ -12,7 +12,6 @@ from rfcore.wire.v1 import edge_pb2 as pb
 SLICE_BYTES = 4_500
 THREE = (Reference.CORRECTION, Reference.WARP, Reference.RENDER)
 TURN = Pose((412.34, -87.65, 1.43), (0.5, 0.5, -0.5, 0.5))
-RELIT = (4096, 0, 0, -2048, *(0, 4096, 0, 60, 0, 0, 4096, -60))
 
 BUDGET_BYTES = {
     "envelope": 3,
@@ -75,22 +74,11 @@ def test_the_long_form_costs_more_than_twice_as_much() -> None:
     assert sum(budget.values()) == 232
 
 
-def test_the_light_of_an_earlier_frame_adds_three_bytes() -> None:
+def test_light_costs_three_bytes_and_what_is_sent_of_it() -> None:
     frame = frame_of(TURN.rounded())
-    packet = replace(frame.packet, relit=True)
-    assert budget_bytes(replace(frame, packet=packet)) == BUDGET_BYTES | {"relit": 3}
-
-
-def test_a_light_that_is_sent_adds_its_length_and_four_bytes() -> None:
-    frame = frame_of(TURN.rounded())
-    packet = replace(frame.packet, relit=True, light=bytes(509))
-    budget = budget_bytes(replace(frame, packet=packet))
-    assert (budget["relit"], budget["light"]) == (3, 4 + 509)
-
-
-def test_a_new_light_adds_at_most_three_bytes_a_number() -> None:
-    frame = frame_of(TURN.rounded())
-    worst = replace(frame.packet, photometric=(-(1 << 15),) * 12)
-    assert budget_bytes(replace(frame, packet=worst))["photometric"] == 2 + 12 * 3
-    usual = replace(frame.packet, photometric=RELIT)
-    assert budget_bytes(replace(frame, packet=usual))["photometric"] <= 22
+    earlier = replace(frame.packet, relit=True)
+    assert budget_bytes(replace(frame, packet=earlier)) == BUDGET_BYTES | {"relit": 3}
+    sent = budget_bytes(replace(frame, packet=replace(earlier, light=bytes(509))))
+    assert (sent["relit"], sent["light"]) == (3, 4 + 509)
+    matrix = replace(frame.packet, photometric=(-(1 << 15),) * 12)
+    assert budget_bytes(replace(frame, packet=matrix))["photometric"] == 2 + 12 * 3
