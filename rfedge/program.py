@@ -7,11 +7,13 @@ A user's mistake ends in one line on stderr and exit status 2, never in a traceb
 
 from __future__ import annotations
 
+import inspect
 import io
 import os
 import select
 import sys
 from collections.abc import Callable
+from functools import cache
 from importlib.metadata import version
 from typing import Protocol
 
@@ -51,6 +53,7 @@ class Verb(Protocol):
 
 def run_program(name: str, parse: Callable[[], Verb]) -> int:
     """Parse the command line with ``parse``, run the verb, and return the exit status."""
+    _wrap_help_as_paragraphs()
     if isinstance(sys.stdout, io.TextIOWrapper):  # so that a log file gets each line at once
         sys.stdout.reconfigure(line_buffering=True)
     try:
@@ -61,6 +64,24 @@ def run_program(name: str, parse: Callable[[], Verb]) -> int:
             return 2
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at the exit
         return SIGPIPE_STATUS
+
+
+@cache
+def _wrap_help_as_paragraphs() -> None:
+    """Let tyro wrap the docstring of an option as one paragraph.
+
+    tyro 1.0 breaks it where the source does, because it does not remove the indentation of the
+    docstring's further lines. Another version without this function keeps its own line breaks.
+    """
+    module, name = sys.modules.get("tyro._docstrings"), "parse_docstring_from_object"
+    parse = getattr(module, name, None)
+    if parse is None:
+        return
+
+    def cleaned(documented: object) -> dict[str, str]:
+        return {option: inspect.cleandoc(text) for option, text in parse(documented).items()}
+
+    setattr(module, name, cleaned)
 
 
 def _nobody_reads() -> bool:

@@ -98,6 +98,13 @@ def test_placeholders_say_what_they_want(verb: str, shown: str) -> None:
     assert f" {shown} " in in_one_line(help_of(verb))
 
 
+def test_the_help_of_an_option_is_one_paragraph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where its docstring goes on in a second line, the terminal's width decides alone."""
+    monkeypatch.setenv("COLUMNS", "500")
+    done = rfedge("train", "--help")
+    assert "KITTI, ...). Of a folder that `rfedge dataset split` made" in done.stdout
+
+
 def test_the_version_is_that_of_the_distribution() -> None:
     done = in_a_process("--version")
     assert (done.returncode, done.stdout) == (0, f"rfedge {version('rfedge')}\n")
