@@ -1,5 +1,6 @@
 """Links of the documentation lead somewhere, and the commands in it are commands."""
 
+import importlib
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -67,6 +68,51 @@ def test_options_named_in_prose_exist(page: Path) -> None:
         if program in PROGRAMS and "--tyro" not in span:
             known = build_site.option_names(program)
             assert set(re.findall(r"--[a-z][a-z0-9-]*", span)) <= known, span
+
+
+SPANS = {
+    str(page.relative_to(ROOT)): re.findall(r"`([^`\n]+)`", prose_and_blocks(page)[0])
+    for page in WRITTEN
+}
+SOURCES = ("rfcore", "cav_agent", "mec_server", "rfedge", "streetgen", "lab")
+FOLDERS = (*SOURCES, "tests", "deploy", "docs", "examples", "samples", "proto", "requirements")
+
+
+@pytest.mark.parametrize("spans", SPANS.values(), ids=SPANS)
+def test_files_named_in_prose_exist(spans: list[str]) -> None:
+    for span in spans:
+        if re.fullmatch(rf"(?:{'|'.join(FOLDERS)})/[\w./-]*", span) and "NAME" not in span:
+            assert (ROOT / span).exists(), span
+
+
+@pytest.mark.parametrize("spans", SPANS.values(), ids=SPANS)
+def test_python_names_in_prose_exist(spans: list[str]) -> None:
+    for span in spans:
+        name = re.match(rf"(?:{'|'.join(SOURCES)})(?:\.\w+)+(?::[\w.]+)?(?=\(|$)", span)
+        if name is not None and "VEHICLE" not in span:  # which is in a subject of NATS
+            assert resolved(name[0].replace(":", ".")) is not None, span
+
+
+def resolved(name: str) -> object:
+    """Import the longest module that a dotted name begins with; return the attribute."""
+    words = name.split(".")
+    for count in range(len(words), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(words[:count]))
+        except ModuleNotFoundError:
+            continue
+        for attribute in words[count:]:
+            found = getattr(found, attribute)
+        return found
+    raise AssertionError(name)
+
+
+def test_tests_named_in_prose_exist() -> None:
+    sources = "".join(path.read_text(encoding="utf-8") for path in ROOT.glob("tests/**/*.py"))
+    defined = set(re.findall(r"def (test_\w+)", sources))
+    named = {span for spans in SPANS.values() for span in spans if span.startswith("test_")}
+    assert named - defined == set()
+    assert named, "explanation/method.md names tests"
 
 
 def test_programs_have_their_page_with_every_verb() -> None:
