@@ -21,6 +21,7 @@ import structlog
 
 from cav_agent.backoff import Backoff
 from cav_agent.config import AgentLimits
+from cav_agent.frame_log import DriveObserver
 from cav_agent.frames import (
     Capture,
     EncodedFrame,
@@ -43,7 +44,6 @@ __all__ = [
     "CameraTaken",
     "FieldNotServed",
     "StreamClient",
-    "StreamObserver",
     "StreamOwner",
 ]
 
@@ -93,22 +93,6 @@ class StreamOwner(Protocol):
         """The server takes pictures now."""
 
 
-class StreamObserver(Protocol):
-    """Records what happens to a stream's connection."""
-
-    def connected(self, is_connected: bool) -> None:
-        """The server welcomed the vehicle, or its stream was lost."""
-
-    def retrying(self, reason: RetryReason) -> None:
-        """Something failed and will be tried again."""
-
-    def noticed(self, notice: StreetNotice) -> None:
-        """The server sent a notice of the street."""
-
-    def message_unknown(self) -> None:
-        """The server sent a message that this agent does not know, and ignores."""
-
-
 @dataclass(frozen=True)
 class CameraSource:
     """Takes the pictures at a place of the drive, posed for the stream's tile, and encodes them."""
@@ -130,7 +114,7 @@ class StreamClient:
         session: AgentSession,
         source: CameraSource,
         owner: StreamOwner,
-        observer: StreamObserver,
+        observer: DriveObserver,
         limits: AgentLimits,
         *,
         tile: str,

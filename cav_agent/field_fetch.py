@@ -14,13 +14,14 @@ import hashlib
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Protocol
+from typing import TYPE_CHECKING, BinaryIO
 
 import grpc
 import structlog
 
 from cav_agent.server_connection import retry_after_s
 from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
+from rfcore.field import FieldStore
 from rfcore.field.archive import PREFIX_BYTES, array_ends, header_end
 from rfcore.field.splat_archive import detail_ends
 from rfcore.wire.v1 import field_pb2 as pb
@@ -29,7 +30,7 @@ from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 if TYPE_CHECKING:
     from rfcore.wire.v1.field_pb2_grpc import FieldServiceAsyncStub
 
-__all__ = ["MAX_FIELD_BYTES", "Beginnings", "Store", "fetch_field"]
+__all__ = ["MAX_FIELD_BYTES", "Beginnings", "fetch_field"]
 
 log = structlog.get_logger()
 
@@ -43,16 +44,6 @@ MAX_REFUSALS = 60
 """Tries of a transfer that broke, and of one that a server has no room for: about a minute."""
 
 RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL, grpc.StatusCode.CANCELLED)
-
-
-class Store(Protocol):
-    """A directory of field archives, as ``rfcore.field.FieldStore``."""
-
-    def ids(self) -> tuple[str, ...]:
-        """Return the ids of the fields there."""
-
-    def add(self, source: bytes | Path, field_id: str | None = None) -> str:
-        """Add an archive, checked against ``field_id`` before it is parsed."""
 
 
 class Beginnings:
@@ -95,7 +86,7 @@ def _first_bytes(partial: Path, count: int) -> bytes:
 
 async def fetch_field(
     channel: grpc.aio.Channel,
-    store: Store,
+    store: FieldStore,
     field_id: str,
     folder: Path,
     metadata: Metadata = (),
@@ -201,7 +192,7 @@ def _append(file: BinaryIO, chunk: bytes) -> None:
     file.flush()
 
 
-def _check_and_add(store: Store, field_id: str, partial: Path) -> None:
+def _check_and_add(store: FieldStore, field_id: str, partial: Path) -> None:
     """Add the file to the store, or remove it: a wrong digest cannot be resumed from."""
     try:
         with partial.open("rb") as file:

@@ -18,7 +18,6 @@ from cav_agent.handover import HandoverCause, ServedTile
 from cav_agent.live.source import SourceProblem
 from cav_agent.metrics import AgentMetrics
 from cav_agent.pose_feed.fix import FeedProblem
-from cav_agent.rate_control import QualitySteps
 from rfcore.field import RadianceField
 from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.wire.address import Address
@@ -28,6 +27,9 @@ from rfcore.wire.values import ClockKind
 __all__ = ["DriveObserver", "log_line"]
 
 log = structlog.get_logger()
+
+LOGGED_CRF = 4.0
+"""A change of quality by less is not logged: 4 of CRF change the bits by 60 %."""
 
 LOGGED_OFFSET_S = 0.1
 """A change of the pose feed's time offset by less is not logged."""
@@ -51,7 +53,7 @@ class DriveObserver:
         self._notice_takers = tuple(notice_takers)
         self._servers = tuple(servers)
         self._frame_log = frame_log
-        self._quality_steps = QualitySteps()
+        self._logged_crf: float | None = None
         self._pose_state: LocalisationState | None = None
         self._feed_offset_s: float | None = None
 
@@ -164,18 +166,21 @@ class DriveObserver:
         encoded, budget = result.encoded, result.budget
         if encoded is None or encoded.crf is None or budget is None:
             return
-        step = self._quality_steps.step(encoded.crf)
-        if step is not None:
-            before, after = step
-            rate_bps = budget.rate_bps
-            log.info(
-                "quality falls" if after > before else "quality rises",
-                session=result.session_id,
-                crf=round(after, 1),
-                crf_before=round(before, 1),
-                target_bytes=round(budget.target_bytes),
-                proven_mbps=None if rate_bps is None else round(rate_bps / 1e6, 3),
-            )
+        before, crf = self._logged_crf, encoded.crf
+        if before is not None and abs(crf - before) < LOGGED_CRF:
+            return
+        self._logged_crf = crf
+        if before is None:
+            return
+        rate_bps = budget.rate_bps
+        log.info(
+            "quality falls" if crf > before else "quality rises",
+            session=result.session_id,
+            crf=round(crf, 1),
+            crf_before=round(before, 1),
+            target_bytes=round(budget.target_bytes),
+            proven_mbps=None if rate_bps is None else round(rate_bps / 1e6, 3),
+        )
 
 
 def _log_failure(result: FrameResult) -> None:

@@ -19,7 +19,6 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import structlog
@@ -270,14 +269,6 @@ def _retry_reason(error: BaseException) -> RetryReason:
     return RetryReason.REFUSED if isinstance(error, ProtocolError) else RetryReason.FIELD
 
 
-@dataclass(frozen=True)
-class RunningClient:
-    """A client and the task in which it runs."""
-
-    client: StreamClient
-    task: asyncio.Task[None]
-
-
 class TileStream:
     """A tile's stream: prepared, open, or closed; ``retry_at_s`` holds both back after an error."""
 
@@ -290,20 +281,17 @@ class TileStream:
     ) -> None:
         self.served = served
         self.retry_at_s = 0.0
+        self.client: StreamClient | None = None
+        """Takes the pictures; None while none is open, or the last one is closing."""
         self._prepare = prepare
         self._owner = owner
         self._changed = changed
         self._open: OpenStream | None = None
         self._preparing: asyncio.Task[OpenStream] | None = None
-        self._current: RunningClient | None = None
-        self._successor: RunningClient | None = None
-        self._closing: list[RunningClient] = []
+        self._successor: StreamClient | None = None
+        self._running: dict[StreamClient, asyncio.Task[None]] = {}
+        """Every client that was opened and not collected, with its task."""
         self._backoff = Backoff(FIRST_RETRY_S, LONGEST_RETRY_S)
-
-    @property
-    def client(self) -> StreamClient | None:
-        """The client that takes pictures; None while none is open, or the last one is closing."""
-        return None if self._current is None else self._current.client
 
     @property
     def is_streaming(self) -> bool:
@@ -319,7 +307,7 @@ class TileStream:
     def tasks(self) -> list[asyncio.Task[OpenStream] | asyncio.Task[None]]:
         """The tasks that have not been collected."""
         preparing = [] if self._preparing is None else [self._preparing]
-        return [*preparing, *(running.task for running in self._running())]
+        return [*preparing, *self._running.values()]
 
     def prepare(self, now: float) -> None:
         """Begin to fetch and open the field, unless that is done or going on."""
@@ -332,25 +320,24 @@ class TileStream:
         self.prepare(now)
         if self._open is None or now < self.retry_at_s:
             return
-        if self._closing:
-            return
-        if self._current is None:
-            self._current = self._run(self._open)
+        if self._running.keys() - {self.client, self._successor}:
+            return  # one is closing
+        if self.client is None:
+            self.client = self._run(self._open)
         elif self.is_draining and self._successor is None:
             self._successor = self._run(self._open)
 
     def close(self) -> None:
         """Finish what was taken, then close the stream."""
-        self._closing = self._running()
-        self._current = self._successor = None
-        for running in self._closing:
-            running.client.finish()
+        self.client = self._successor = None
+        for client in self._running:
+            client.finish()
 
     def stop(self) -> None:
         """Finish the frame in flight, drop what waits, then close the stream."""
-        for running in self._running():
-            running.client.stop()
-        self.close()
+        self.client = self._successor = None
+        for client in self._running:
+            client.stop()
 
     def withdraw(self) -> None:
         """Let a picture go that waits for a server which does not answer: another takes over."""
@@ -359,8 +346,8 @@ class TileStream:
 
     async def wait_closed(self) -> None:
         """Wait until the stream has ended; raise the error with which it did."""
-        for running in self._running():
-            await running.task
+        for task in tuple(self._running.values()):
+            await task
 
     def hold_back(self, now: float) -> float:
         """Try nothing for a while, since something failed; return for how many seconds."""
@@ -376,11 +363,13 @@ class TileStream:
         if self._preparing is not None and self._preparing.done():
             ended.append(self._preparing)
             self._preparing = None
-        for running in self._running():
-            if running.task.done():
-                running.client.abandon("its stream was given up")
-                ended.append(running.task)
-                self._forget(running)
+        for client, task in tuple(self._running.items()):
+            if task.done():
+                client.abandon("its stream was given up")
+                ended.append(task)
+                del self._running[client]
+                self.client = None if client is self.client else self.client
+                self._successor = None if client is self._successor else self._successor
         self._take_over()
         errors = (task.exception() for task in ended)
         return next((error for error in errors if error is not None), None)
@@ -388,31 +377,18 @@ class TileStream:
     def _take_over(self) -> None:
         """Give the pictures to the successor once its server has welcomed the vehicle, or once the
         first stream has ended."""
-        current, successor = self._current, self._successor
-        if successor is None or not (successor.client.is_streaming or current is None):
+        current, successor = self.client, self._successor
+        if successor is None or not (successor.is_streaming or current is None):
             return
         if current is not None:
-            current.client.finish()
-            self._closing.append(current)
-        self._current, self._successor = successor, None
+            current.finish()
+        self.client, self._successor = successor, None
 
-    def _running(self) -> list[RunningClient]:
-        open_clients = (self._current, self._successor)
-        return [*self._closing, *(running for running in open_clients if running is not None)]
-
-    def _forget(self, ended: RunningClient) -> None:
-        if ended is self._current:
-            self._current = None
-        elif ended is self._successor:
-            self._successor = None
-        else:
-            self._closing.remove(ended)
-
-    def _run(self, open_stream: OpenStream) -> RunningClient:
+    def _run(self, open_stream: OpenStream) -> StreamClient:
         client = open_stream(self._owner)
-        running = RunningClient(client, asyncio.create_task(client.run()))
-        running.task.add_done_callback(self._task_ended)
-        return running
+        task = self._running[client] = asyncio.create_task(client.run())
+        task.add_done_callback(self._task_ended)
+        return client
 
     def _task_ended(self, _: asyncio.Task[Any]) -> None:
         self._changed.set()

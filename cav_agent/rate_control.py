@@ -31,7 +31,7 @@ from cav_agent.path_estimator import PathEstimator
 from rfcore.errors import InvalidInput
 from rfcore.wire.messages import FrameAddress
 
-__all__ = ["LEAST_CAMERA_SHARE", "BitDivision", "ByteBudget", "QualitySteps", "RateControl"]
+__all__ = ["LEAST_CAMERA_SHARE", "BitDivision", "ByteBudget", "RateControl"]
 
 SHARE = 0.75
 """Share of the delay that is aimed at; the rest is a margin for frames, path and machine."""
@@ -65,9 +65,6 @@ HALVING_CRF = 6.0
 
 OVERHEAD_BYTES = 150
 """Pose, digests, gRPC and HTTP/2 framing around a slice: assumed until one was sent."""
-
-STEP_CRF = 4.0
-"""A change of quality worth a line in the log: 4 of CRF change the bits by 60 %."""
 
 
 @dataclass(frozen=True)
@@ -117,11 +114,6 @@ class RateControl:
         self._captured_s: float | None = None
         self._instants: dict[Hashable, InstantInFlight] = {}
         self._instant_of: dict[FrameAddress, Hashable] = {}
-
-    @property
-    def rate_bps(self) -> float | None:
-        """What answers have proven the path to carry; None before the first one."""
-        return self._path.rate_bps
 
     def captured(self, now: float) -> None:
         """A picture was captured, or those of an instant."""
@@ -268,21 +260,6 @@ class BitDivision:
             c: total_bytes * (least + (1 - LEAST_CAMERA_SHARE) * weight / whole)
             for c, weight in weights.items()
         }
-
-
-class QualitySteps:
-    """Detects changes of CRF that are worth a line in the log."""
-
-    def __init__(self) -> None:
-        self._reported: float | None = None
-
-    def step(self, crf: float) -> tuple[float, float] | None:
-        """Return (before, after) when ``crf`` is ``STEP_CRF`` from the one reported last."""
-        before = self._reported
-        if before is not None and abs(crf - before) < STEP_CRF:
-            return None
-        self._reported = crf
-        return None if before is None else (before, crf)
 
 
 def _mean(known: float | None, found: float) -> float:

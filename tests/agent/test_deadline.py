@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cav_agent.deadline import DeadlineController, DeadlineLimits, DeadlineRungs, Step
+from cav_agent.deadline import DeadlineController, DeadlineRungs, Step
 from rfcore.codec.sender.ladder import MeasuredRung, Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality
@@ -21,8 +21,8 @@ PERIOD_S = 0.1
 class Machine:
     """Codes a frame every 100 ms, ``slowness`` times the ladder's milliseconds each."""
 
-    def __init__(self, deadline_ms: float, limits: DeadlineLimits | None = None) -> None:
-        self.controller = DeadlineController(RUNGS, deadline_ms, limits)
+    def __init__(self, deadline_ms: float) -> None:
+        self.controller = DeadlineController(RUNGS, deadline_ms)
         self.now = 100.0
         self.steps: list[tuple[float, Step]] = []
 
@@ -108,9 +108,10 @@ def test_frames_without_the_field_say_only_that_they_were_late() -> None:
     assert controller.current is MIDDLE
     slowness = controller.slowness
     for k in range(100):
-        assert controller.measured_in_part(MIDDLE, 5.0, machine.now + k) is None
+        assert controller.measured(MIDDLE, 5.0, machine.now + k, in_field=False) is None
     assert (controller.slowness, controller.current) == (slowness, MIDDLE)
-    steps = [controller.measured_in_part(MIDDLE, 250.0, machine.now + 100 + k) for k in range(9)]
+    later = machine.now + 100
+    steps = [controller.measured(MIDDLE, 250.0, later + k, in_field=False) for k in range(9)]
     assert [step.after for step in steps if step is not None] == [FAST]
 
 
@@ -152,7 +153,7 @@ def test_the_deadline_of_a_rig_is_that_of_all_its_cameras_together() -> None:
     rungs = DeadlineRungs(controller, lambda c, _: seen.append(c.slowness))
     for instant in (1, 2):
         for _ in range(4):
-            rungs.coded(0.030, 100.0 + instant, instant)
+            rungs.coded(0.030, 100.0 + instant, instant, in_field=True)
     assert seen == [pytest.approx(4 * 30.0 / SLOW.sender_ms)]
     assert controller.late
     assert controller.current is not SLOW
@@ -163,5 +164,5 @@ def test_a_camera_that_stands_alone_is_measured_frame_by_frame() -> None:
     seen: list[float | None] = []
     rungs = DeadlineRungs(controller, lambda c, _: seen.append(c.slowness))
     for _ in range(3):
-        rungs.coded(0.080, 100.0)
+        rungs.coded(0.080, 100.0, 0, in_field=True)
     assert seen == [1.0, 1.0, 1.0]

@@ -165,9 +165,7 @@ class RecordedRungs(FixedRung):
         self.sender_s: list[float] = []
         self.in_field: list[bool] = []
 
-    def coded(
-        self, sender_s: float, now: float, instant: int = 0, *, in_field: bool = True
-    ) -> None:
+    def coded(self, sender_s: float, now: float, instant: int, *, in_field: bool) -> None:
         del now, instant
         self.sender_s.append(sender_s)
         self.in_field.append(in_field)

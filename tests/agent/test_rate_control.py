@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
-from cav_agent.rate_control import ByteBudget, QualitySteps, RateControl
+from cav_agent.rate_control import ByteBudget, RateControl
 from cav_agent.session import AgentSession
 from rfcore.camera import Pose
 from rfcore.codec.h264.config import CodecConfig
@@ -336,12 +336,6 @@ def test_what_can_never_be_in_time_is_still_sent_small(
     pictures = drive_over(link((0, 1e6)), 0.05)
     assert kept(pictures, 0.05) == 0.0
     assert max(p.payload_bytes for p in pictures[5:]) < 1000
-
-
-def test_a_step_of_quality_is_reported_once() -> None:
-    steps = QualitySteps()
-    crfs = [23.0, 24.0, 28.0, 30.0, 23.5]
-    assert [steps.step(crf) for crf in crfs] == [None, None, (23.0, 28.0), None, (28.0, 23.5)]
 
 
 @pytest.mark.parametrize("max_delay_s", [0.0, 0.009, 61.0, float("nan"), float("inf")])
