@@ -1,7 +1,7 @@
-"""How long to wait before something is tried again: exponential back-off with jitter.
+"""Exponential back-off with jitter: how long to wait before something is tried again.
 
 The pause doubles with every failure in a row, up to a longest one, and half of it is left to
-chance, so that the vehicles that lost one server do not all come back to it at once ("equal
+chance. So the vehicles that lost one server do not all come back to it at once ("equal
 jitter": <https://aws.amazon.com/blogs/architecture/exponential-backoff-and-jitter/>).
 """
 
@@ -35,5 +35,5 @@ class Backoff:
         return pause_s * (0.5 + 0.5 * self._chance())
 
     def reset(self) -> None:
-        """Begin again with the shortest pause: it worked."""
+        """Begin again with the shortest pause, after a success."""
         self._pause_s = self._first_s

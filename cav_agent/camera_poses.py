@@ -1,4 +1,4 @@
-"""Where a camera was when it took a picture: the pose that the field is rendered at and sent with.
+"""Finds where a camera took a picture: the pose that the field is rendered at, and that is sent.
 
 A pose comes from a ``PoseSource`` (the dataset, a feed, a trajectory), or is found in the field
 (``cav_agent.tracking``). The cameras of a rig follow from the rig's pose and their extrinsics. The
@@ -45,7 +45,7 @@ REFERENCE_SILENT_NS = NS
 
 @dataclass(frozen=True)
 class CameraLocation:
-    """Where a camera took a picture; ``camera`` is ``None`` while it is lost.
+    """The place at which a camera took a picture; ``camera`` is ``None`` while it is lost.
 
     ``pose``: the one to send, the camera's or its rig's. ``state``: how it was found in the field,
     where that is done. ``fix``: what the camera's tracker found. ``view``: what the field shows
@@ -60,7 +60,7 @@ class CameraLocation:
 
 
 class CameraPoses(Protocol):
-    """Says where one camera was; asked once for each of its pictures, in order."""
+    """Locates one camera; called once for each of its pictures, in order."""
 
     def locate(self, capture: Capture, frame: I420, rung: Rung) -> CameraLocation:
         """Return where a picture was taken; raise ``RfedgeError`` before anything is known."""
@@ -70,7 +70,7 @@ class CameraPoses(Protocol):
 
 
 class PoseSource(Protocol):
-    """Where measured poses of a camera come from, in a field's axes."""
+    """A source of a camera's measured poses, in a field's axes."""
 
     def camera(self, capture: Capture) -> Camera:
         """Return a picture's camera, its pose rounded as it is sent; raise ``RfedgeError``."""
@@ -130,7 +130,7 @@ class KnownPoses:
 
 @dataclass(frozen=True)
 class RigPose:
-    """Where a rig was when a picture was taken, rounded as it is sent; ``None``: it is lost.
+    """A rig's pose when a picture was taken, rounded as it is sent; ``None``: it is lost.
 
     ``state``: how it was found in the field, if it is looked for there.
     """
@@ -140,7 +140,7 @@ class RigPose:
 
 
 class RigPoses(Protocol):
-    """Says where a rig was."""
+    """Locates a rig."""
 
     def at(self, capture: Capture) -> RigPose:
         """Return the rig's pose at a capture; raise ``RfedgeError`` before anything is known."""

@@ -64,7 +64,7 @@ class VehicleCameras(Protocol):
         """The cameras; the first is the one by which poses are known."""
 
     def __len__(self) -> int:
-        """Return how many places there are on the drive."""
+        """Return the number of places on the drive."""
 
     def take(self, index: int) -> tuple[Capture, ...]:
         """Take the pictures at place ``index`` now, of every camera that has one."""
@@ -92,7 +92,7 @@ class RecordedCameras:
 
     @property
     def positions(self) -> tuple[Position, ...]:
-        """Where the vehicle was at each instant."""
+        """Return where the vehicle was at each instant."""
         return tuple(instant.world_from_rig.translation_m[:2] for instant in self._instants)
 
     def take(self, index: int) -> tuple[Capture, ...]:

@@ -1,4 +1,4 @@
-"""When the next picture of a drive is captured: the first step of a frame's path.
+"""Decides when the next picture of a drive is captured: the first step of a frame's path.
 
 ``Realtime`` captures picture i at its time, whatever became of the ones before. ``Lockstep``
 captures the next picture when the previous one was answered, and a lost one again. An experiment
@@ -29,7 +29,7 @@ ROUNDING_S = 1e-6
 """Tolerance for the rounding error of summed periods."""
 
 MAX_TRIES = 5
-"""How often lockstep captures the same picture before it gives up."""
+"""Captures of the same picture before lockstep gives up."""
 
 HOPELESS = frozenset({EndReason.NOT_CODED, EndReason.OVERSIZE})
 """Ends that another capture of the same picture would only repeat."""
@@ -52,11 +52,11 @@ class CaptureSchedule(Protocol):
 
     @property
     def finished(self) -> bool:
-        """Whether no further picture will be captured."""
+        """Return whether no further picture will be captured."""
 
 
 class RateLimit:
-    """Allows so many captures per second on average; 0 Hz, as at first: any number."""
+    """Limits the captures per second on average; at first, and with 0 Hz, any number is allowed."""
 
     def __init__(self) -> None:
         self.period_s = 0.0
@@ -78,7 +78,7 @@ class RateLimit:
 
 
 class Realtime:
-    """Picture i at ``start + i / rate_hz``; a caller that asks late gets every picture, late.
+    """Captures picture i at ``start + i / rate_hz``; a caller that asks late gets each one late.
 
     Under a limit, pictures in between are not captured: the drive goes on at its own speed.
     """
@@ -116,7 +116,7 @@ class Realtime:
 
     @property
     def finished(self) -> bool:
-        """Whether every picture was captured and the drive is not to begin again."""
+        """Return whether every picture was captured and the drive is not to begin again."""
         return not self._loop and self._count >= self._pictures
 
     def _due_s(self, start_s: float) -> float:
@@ -124,7 +124,7 @@ class Realtime:
 
 
 class Lockstep:
-    """The next picture when the previous was answered, no sooner than the server's limit allows.
+    """Captures the next picture when the previous was answered and the server's limit allows it.
 
     A lost picture is captured again. A rig of several ``cameras`` captures its next instant when
     all pictures of the last have ended, and all of them again when one was lost. A camera whose
@@ -180,7 +180,7 @@ class Lockstep:
 
     @property
     def finished(self) -> bool:
-        """Whether every picture was answered."""
+        """Return whether every picture was answered."""
         return not self._loop and self._index >= self._pictures
 
 

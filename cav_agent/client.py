@@ -1,8 +1,8 @@
-"""A vehicle's stream to one server on grpc.aio: keeps it open and moves pictures through it.
+"""A vehicle's stream to one server on grpc.aio.
 
-Three coroutines: ``_encode_pictures`` gets captured pictures encoded (on the encoder's thread) and
+Three coroutines: ``_encode_pictures`` has captured pictures encoded (on the encoder's thread) and
 reports how they ended; ``_stay_connected`` opens stream after stream; inside it a reader and a
-writer move bytes. All decisions are those of ``cav_agent.session``.
+writer move bytes. ``cav_agent.session`` makes all decisions.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ log = structlog.get_logger()
 Stream = grpc.aio.StreamStreamCall[bytes, bytes]
 
 PROCESS = uuid.uuid4().hex
-"""Tells a server which streams are of one process, so that no other sends the same camera."""
+"""Lets a server know which streams are of one process, so that no other sends the same camera."""
 
 FINAL = frozenset(
     {
@@ -62,17 +62,17 @@ FINAL = frozenset(
         grpc.StatusCode.DATA_LOSS,
     }
 )
-"""Statuses that another try on the same terms would only repeat: they end the client. Whether the
-drive ends with it is for ``cav_agent.handover_controller`` to say."""
+"""Statuses that another try on the same terms would only repeat: they end the client.
+``cav_agent.handover_controller`` decides whether the drive ends with it."""
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.02, 1.0
-"""Between streams: short after one that was welcomed, doubling while none is."""
+"""Pauses between streams: short after a welcomed one, doubling while none is welcomed."""
 
 CAMERA_TAKEN = "camera_taken"
 """First word of the details with which a server refuses a camera that another agent sends."""
 
 CAMERA_TAKEN_TRIES = 2
-"""A server says when to try again: by then, an agent that has died no longer holds its camera."""
+"""A server says when to try again. By then, an agent that has died no longer holds its camera."""
 
 
 class CameraTaken(ProtocolError):
@@ -84,7 +84,7 @@ class FieldNotServed(ProtocolError):
 
 
 class StreamOwner(Protocol):
-    """Who opened a stream and gives it pictures."""
+    """Opens a stream and gives it pictures."""
 
     def ended(self, result: FrameResult) -> None:
         """A captured picture came to its end; raise ``RfedgeError`` to end the stream."""
@@ -139,12 +139,12 @@ class StreamClient:
 
     @property
     def is_streaming(self) -> bool:
-        """Whether the server has welcomed the vehicle and pictures can go on being captured."""
+        """Return whether the server has welcomed the vehicle and pictures may be captured."""
         return not self._is_finishing and self._session.state is LinkState.STREAMING
 
     @property
     def is_draining(self) -> bool:
-        """Whether the server is draining: it takes pictures until another one does."""
+        """Return whether the server is draining: it takes pictures until another one does."""
         return self._session.is_draining
 
     @property
@@ -158,7 +158,7 @@ class StreamClient:
         self._changed.set()
 
     def withdraw(self) -> None:
-        """Let the picture go that waits for the encoder: another server takes the vehicle over."""
+        """Drop the picture that waits for the encoder: another server takes the vehicle over."""
         self._session.withdraw()
         self._changed.set()
 
@@ -217,7 +217,7 @@ class StreamClient:
                 encoding.cancel()
 
     def _advance(self, now: float) -> None:
-        """Let the session know the time."""
+        """Pass the time to the session, and act on what it decides."""
         session = self._session
         session.handle_timer(now)
         if session.failed is not None:
@@ -354,7 +354,7 @@ class StreamClient:
                 await self._may_write.wait()
 
     async def _close(self, connecting: asyncio.Task[None]) -> None:
-        """Say that no more frames come, and let the server finish."""
+        """Announce that no more frames come, and let the server finish."""
         self._finished = True
         if self._stream is None:
             return

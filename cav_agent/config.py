@@ -25,17 +25,18 @@ class AgentLimits:
     """Time limits in seconds, and how many pictures may wait for the encoder."""
 
     greeting_s: Annotated[float, Suppress] = 10.0
-    """From Hello to Welcome."""
+    """Longest time from Hello to Welcome."""
     answer_s: Annotated[float, Suppress] = 5.0
-    """From encoding to Ack or Nack, before the stream is given up; less once the server's usual
-    time is known (``AnswerTimeout``)."""
+    """Longest time from encoding to Ack or Nack before the stream is given up; less once the
+    server's usual time is known (``AnswerTimeout``)."""
     stall_s: Annotated[float, Suppress] = 1.0
-    """How long a server may pause beyond its usual time."""
+    """Longest pause of a server beyond its usual time."""
     give_up_s: Annotated[float, arg(name="give-up-s")] = 0.0
     """How many seconds without any server before the drive ends with an error; 0: never."""
     drain_s: Annotated[float, Suppress] = 5.0
-    """For the last frames, after ``stop`` and at the end of the drive."""
+    """Longest time for the last frames, after ``stop`` and at the end of the drive."""
     slot_frames: Annotated[int, Suppress] = 1
+    """Instants that may wait for the encoder."""
 
     def __post_init__(self) -> None:
         for name in ("greeting_s", "answer_s", "stall_s"):
@@ -49,7 +50,7 @@ class AgentLimits:
 
 
 class PaceKind(StrEnum):
-    """When the next picture is captured."""
+    """The rule by which the next picture is captured."""
 
     LOCKSTEP = "lockstep"
     REALTIME = "realtime"

@@ -1,4 +1,4 @@
-"""Which rung of the ladder the next frame is coded on, so that it is ready within a deadline.
+"""Chooses the rung of the ladder for the next frame, so that it is ready within a deadline.
 
 A rung is one setting of the sender; the ladder says what each took and cost on the machine that
 measured it. ``slowness`` is how much longer a frame takes here and now, a running mean over the
@@ -33,7 +33,7 @@ ROOM = 0.85
 """Share of the deadline that a better rung must be predicted to stay below."""
 
 CLIMB_DELAY_S, MAX_CLIMB_DELAY_S = 2.0, 60.0
-"""For how long it must be predicted to do so: at first, and at most."""
+"""Time for which it must be predicted to do so: at first, and at most."""
 
 NEWEST_WEIGHT = 0.25
 """Weight of the newest frame in the running mean."""
@@ -49,7 +49,7 @@ class Step:
 
     @property
     def down(self) -> bool:
-        """Whether accuracy was given up."""
+        """Return whether accuracy was given up."""
         return self.after.rate_percent > self.before.rate_percent
 
 
@@ -73,7 +73,7 @@ class DeadlineController:
 
     @property
     def position(self) -> int:
-        """How many better rungs there are."""
+        """Return how many better rungs there are."""
         return self._rungs.index(self.current)
 
     def measured(

@@ -1,4 +1,4 @@
-"""Radiance fields on the vehicle: fetched from a server, opened, made ready, and kept.
+"""The vehicle's radiance fields: fetched from a server, opened, made ready, and kept.
 
 A frame can be coded once the field of its tile is prepared. A field that is not in the local store
 is fetched from the server that publishes the tile (``cav_agent.field_fetch``). Frames are coded
@@ -47,7 +47,7 @@ SHIPPED_LADDER = Path(__file__).with_name("ladder.json")
 """Rungs measured on the sample street with the field that ships (`rfedge eval ladder`)."""
 
 OWN_AGAIN_S = 10.0
-"""From a failure to fetch a tile's own field to the next try, while something is drawn."""
+"""Pause after a failure to fetch a tile's own field, while something else is drawn."""
 
 MAX_PREPARED = 3
 """Fields kept ready: the previous tile's, the present one's and the next one's."""
@@ -55,7 +55,7 @@ MAX_PREPARED = 3
 
 @dataclass(frozen=True)
 class PreparedCamera:
-    """How one camera's pictures are coded."""
+    """The coding of one camera's pictures."""
 
     camera: VehicleCamera
     codec: CodecConfig
@@ -79,7 +79,7 @@ class PreparedField:
 class FieldCache:
     """Prepares fields by tile and keeps the last ``MAX_PREPARED``; tiles of one field share it.
 
-    ``servers[i]`` is asked for a field of its tiles that is not in the local store.
+    A field that is not in the local store is fetched from ``servers[i]``, which publishes the tile.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class FieldCache:
 
     async def _load(self, served: ServedTile) -> PreparedField:
         tile, loop = served.tile, asyncio.get_running_loop()
-        own = _OwnField()
+        own = ArrivingField()
         preview: tuple[str, ...] = ()
         if self._needs_all or await self._holds(tile.field_id):
             field = await self._opened(served, (tile.field_id,))
@@ -143,7 +143,7 @@ class FieldCache:
             self._begin(self._arrive(served, own))
         return prepared
 
-    async def _first(self, served: ServedTile, own: _OwnField) -> RadianceField:
+    async def _first(self, served: ServedTile, own: ArrivingField) -> RadianceField:
         """Begin to fetch the tile's own field; return what can be drawn of it first."""
         arriving = self._begin(self._arrive(served, own))
         either: set[asyncio.Future[Any]] = {arriving, own.first}
@@ -164,11 +164,14 @@ class FieldCache:
 
     @property
     def _needs_all(self) -> bool:
-        """Whether a drive needs the whole of the tile's own field: a camera is looked for in it
-        (``--localise``), on another thread than takes it, or within its bounds (a feed's)."""
+        """Return whether a drive needs the whole of the tile's own field.
+
+        It does where a camera is searched in it on another thread (``--localise``), and where a
+        feed's positions are checked against its bounds.
+        """
         return self._config.localise or self._config.feed.source is not None
 
-    async def _arrive(self, served: ServedTile, own: _OwnField) -> None:
+    async def _arrive(self, served: ServedTile, own: ArrivingField) -> None:
         """Fetch the tile's own field and have it drawn; try again until all of it is there.
 
         Raises ``RfedgeError`` if it cannot be fetched and nothing can be drawn instead.
@@ -183,7 +186,7 @@ class FieldCache:
                 log.warning("own field not fetched", tile=served.tile.name, problem=str(error))
                 await asyncio.sleep(OWN_AGAIN_S)
 
-    async def _take_own(self, served: ServedTile, own: _OwnField) -> None:
+    async def _take_own(self, served: ServedTile, own: ArrivingField) -> None:
         async def take(field: RadianceField) -> None:
             if own.field is not None:
                 _check_origin(field, own.field)
@@ -244,7 +247,7 @@ class FieldCache:
             self._fetching[served.tile] = asyncio.create_task(self._add_lights(served, lights))
 
     async def _add_lights(self, served: ServedTile, lights: TileLights) -> None:
-        """Fetch and open what is missing, one after the other; the drive goes on without it."""
+        """Fetch and open what is missing, one after the other; the drive does not wait for it."""
         for light in served.tile.other_lights:
             if light.field_id in lights.held_ids():
                 continue
@@ -295,7 +298,7 @@ class FieldCache:
         return DeadlineRungs(controller, self._observer.coded_under_deadline)
 
 
-class _OwnField:
+class ArrivingField:
     """The tile's own field as far as it has arrived, or its preview; used on the event loop."""
 
     def __init__(self) -> None:
@@ -312,14 +315,14 @@ class _OwnField:
             self._lights.take_own(field)
 
     def shown_by(self, lights: TileLights) -> None:
-        """Hand what comes to ``lights``, which have the first one."""
+        """Pass what arrives from now on to ``lights``, which have the first one."""
         self._lights = lights
         if self.field is not None and self.field is not lights.own:
             lights.take_own(self.field)
 
 
 def _without_ground(tile: Tile) -> Tile:
-    """Return what of a tile says which fields there are: tiles of the same ones share them."""
+    """Return the parts of a tile that name its fields: tiles with equal ones share them."""
     return replace(tile, name="any", area=None, margin_m=0.0, version=1)
 
 
@@ -340,6 +343,6 @@ def _prepared_camera(config: AgentConfig, camera: VehicleCamera) -> PreparedCame
 
 
 def _prepare_renderers(field: RadianceField, ladder: Sequence[MeasuredRung]) -> None:
-    """Make every renderer that frames may ask for."""
+    """Make every renderer that frames may need."""
     for quality in {FULL, *(measured.rung.quality for measured in ladder)}:
         field.prepare(replace(quality, detail=min(quality.detail, field.most_detail)))

@@ -1,10 +1,10 @@
-"""A field's archive from a server: resumable, whole or not at all, and of use before it is whole.
+"""Fetches a field's archive from a server; a transfer that broke is resumed.
 
-What arrived lies in a partial file, and is not sent again. Its digest is checked before anything of
-it is parsed as a whole; of archives that begin with their lowest level of detail
-(``rfcore.field.splat_archive``), a beginning is parsed before that, each array of it checked
-against its own digest: the server draws the same from the whole, and whether it is the field that
-was asked for shows at the latest when the server compares a render.
+What has arrived lies in a partial file, and is not sent again. The digest of the whole is checked
+before the archive is parsed. An archive that begins with its lowest level of detail
+(``rfcore.field.splat_archive``) is of use before it is whole: a beginning of it is parsed, each
+array checked against its own digest. The server draws the same from the whole; a beginning of
+another field shows at the latest when the server compares a render.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ log = structlog.get_logger()
 Metadata = tuple[tuple[str, str], ...]
 
 MAX_FIELD_BYTES = 4 << 30
-"""Longest archive the agent takes; more than any vehicle renders in time."""
+"""Longest archive that the agent takes; more than any vehicle renders in time."""
 
 MAX_RESUMES = 5
 MAX_REFUSALS = 60
-"""Tries of a transfer that broke, and of one that a server has no room for: about a minute."""
+"""Tries of a transfer that broke, and of one that the server is too busy for: about a minute."""
 
 RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL, grpc.StatusCode.CANCELLED)
 
 
 class Beginnings:
-    """Hands ``take`` the first bytes of an archive, each time that they draw more than before.
+    """Calls ``take`` with the first bytes of an archive, each time that they draw more than before.
 
-    Nothing is handed over for the whole archive, nor for one that is drawn as a whole only. What
+    It is not called for the whole archive, nor for one that can only be drawn as a whole. What
     ``take`` raises ends the transfer.
     """
 
@@ -58,7 +58,7 @@ class Beginnings:
         self._ends: list[int] | None = None
 
     async def arrived(self, partial: Path, have_bytes: int) -> None:
-        """Look at a partial file of ``have_bytes``; raise ``FieldFormatError`` if it is damaged."""
+        """Examine a partial file of ``have_bytes``; raise ``FieldFormatError`` if it is damaged."""
         if self._ends is None:
             self._ends = await asyncio.to_thread(_ends_of, partial, have_bytes)
         ends = self._ends or []
@@ -102,7 +102,7 @@ async def fetch_field(
     partial = folder / f".{field_id}.part"
     size_bytes = await _size(stub, field_id, metadata)
     log.info("fetching field", field=field_id, size_bytes=size_bytes)
-    await _Transfer(stub, field_id, partial, size_bytes, metadata, beginnings).receive_all()
+    await Transfer(stub, field_id, partial, size_bytes, metadata, beginnings).receive_all()
     await asyncio.to_thread(_check_and_add, store, field_id, partial)
     log.info("field fetched", field=field_id)
 
@@ -123,8 +123,8 @@ async def _size(stub: FieldServiceAsyncStub, field_id: str, metadata: Metadata) 
 
 
 @dataclass(frozen=True)
-class _Transfer:
-    """What is received of a field, and into which file."""
+class Transfer:
+    """Receives a field's archive into a partial file."""
 
     stub: FieldServiceAsyncStub
     field_id: str
@@ -134,7 +134,7 @@ class _Transfer:
     beginnings: Beginnings | None
 
     async def receive_all(self) -> None:
-        """Receive what is missing; resume where it broke, and come again to a busy server."""
+        """Receive what is missing; resume where it broke, and try a busy server again."""
         resumes = refusals = 0
         while True:
             try:
@@ -154,7 +154,7 @@ class _Transfer:
 
     async def _receive(self) -> None:
         have_bytes = self.partial.stat().st_size if self.partial.exists() else 0
-        await self._look(have_bytes)
+        await self._use(have_bytes)
         if have_bytes >= self.size_bytes:
             return
         request = pb.FetchFieldRequest(field_id=self.field_id, offset_bytes=have_bytes)
@@ -169,15 +169,15 @@ class _Transfer:
                     )
                 await asyncio.to_thread(_append, file, response.chunk)
                 have_bytes = end_bytes
-                await self._look(have_bytes)
+                await self._use(have_bytes)
         if have_bytes != self.size_bytes:
             raise FieldFormatError(
                 f"field {self.field_id} ended after {have_bytes} of {self.size_bytes} bytes; try "
                 "again"
             )
 
-    async def _look(self, have_bytes: int) -> None:
-        """Use what has arrived; remove it if it is damaged, for then it cannot be resumed from."""
+    async def _use(self, have_bytes: int) -> None:
+        """Use what has arrived; remove it if it is damaged, so that no transfer resumes from it."""
         if self.beginnings is None:
             return
         try:

@@ -1,7 +1,7 @@
 """Records a drive: a line of JSON per picture, log lines, and metrics.
 
-``DriveObserver`` hears of everything that happens to the vehicle's frames, streams and fields.
-Frames are counted when they have ended, however they ended.
+``DriveObserver`` is called with each event of the vehicle's frames, streams and fields. Frames are
+counted when they have ended, however they ended.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class DriveObserver:
             )
 
     def feed_fixes(self, fixes: int) -> None:
-        """So many more fixes of the pose feed are used."""
+        """Count fixes of the pose feed that are used."""
         self._metrics.feed_fixes.inc(fixes)
 
     def feed_problem(self, problem: FeedProblem, text: str, begins: bool) -> None:
@@ -141,7 +141,7 @@ class DriveObserver:
             log.warning("source lost", camera=camera_id, reason=str(problem), problem=text)
 
     def source_frames(self, taken: int, dropped: int) -> None:
-        """So many more frames of live sources were taken over, or dropped before coding."""
+        """Count frames of live sources that were taken over, or dropped before coding."""
         self._metrics.source_frames.labels("taken").inc(taken)
         self._metrics.source_frames.labels("dropped").inc(dropped)
 

@@ -43,13 +43,13 @@ class Capture:
     captured_s: float
     capture_time_ns: int
     clock: ClockKind | None = None
-    """What the time of capture of a live camera rests on."""
+    """The clock that gave the time of capture of a live camera."""
     received_s: float | None = None
-    """When the agent had the picture of a live camera."""
+    """Time at which the agent had the picture of a live camera."""
     instant: int = 0
     """Pictures of a rig with the same number were taken together; 0: the camera is alone."""
     world_from_rig: Pose | None = None
-    """Where a recorded drive has the rig, rounded as it is sent."""
+    """The rig's pose in a recorded drive, rounded as it is sent."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class EncodeJob:
     budget: ByteBudget | None = None
     """The bytes it may take; ``None``: the configured CRF."""
     started_s: float = 0.0
-    """When it was taken to be coded."""
+    """Time at which coding began."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,11 @@ class EncodedFrame:
     pose: Pose | None
     """The pose to send: the camera's, or its rig's; ``None`` while the camera is lost."""
     pose_state: LocalisationState | None = None
-    """How the pose was found in the field, where that is done."""
+    """State of the search for the pose in the field, where that is done."""
     fix: PoseEstimate | None = None
-    """What the camera's tracker found, where this camera is tracked."""
+    """The tracker's estimate, where this camera is tracked."""
     tries: int = 1
-    """How often it was coded to fit the payload's limit."""
+    """Number of times that it was coded to fit the payload's limit."""
     rung: Rung = FULL_RUNG
     crf: float | None = None
     read_s: float = 0.0
@@ -103,7 +103,7 @@ class EncodedFrame:
 
 
 class Outcome(StrEnum):
-    """How a captured picture ended."""
+    """The end of a captured picture."""
 
     ACKED = "acked"
     NACKED = "nacked"
@@ -112,7 +112,7 @@ class Outcome(StrEnum):
 
 
 class EndReason(StrEnum):
-    """Why a picture or a stream ended: a closed set, fit for a metric's label.
+    """The reason why a picture or a stream ended: a closed set, fit for a metric's label.
 
     A refused frame has the server's ``RejectReason`` instead. Numbers and messages belong into the
     ``problem`` beside the reason.
@@ -145,7 +145,7 @@ class EndReason(StrEnum):
 
 
 class RetryReason(StrEnum):
-    """What failed and is tried again: a closed set, fit for a metric's label."""
+    """The kind of failure that is tried again: a closed set, fit for a metric's label."""
 
     STREAM = "stream"
     """A stream was lost, or refused for the moment; another is opened."""
@@ -175,7 +175,7 @@ class FrameResult:
     outcome: Outcome
     reason: EndReason | RejectReason = EndReason.NONE
     problem: str = ""
-    """What happened, in words."""
+    """The cause in words."""
     encoded: EncodedFrame | None = None
     packet_bytes: int = 0
     """The whole message as sent."""
@@ -185,9 +185,9 @@ class FrameResult:
     server: StageTimes | None = None
     server_digest: bytes = b""
     latency_s: float | None = None
-    """From capture to answer."""
+    """Seconds from capture to answer."""
     link_s: float | None = None
-    """From sending to answer, without the server's own time."""
+    """Seconds from sending to answer, without the server's own time."""
 
     @property
     def packet(self) -> DeltaPacket | None:

@@ -1,4 +1,4 @@
-"""Which server's tile takes each picture of a drive, and which streams are held open.
+"""Decides which server's tile takes each picture of a drive, and which streams are held open.
 
 ``TileRoute`` assigns every picture of a drive to the tile on whose ground it was taken. A vehicle
 that leaves a tile stays with it for a share of the tile's margin, so that driving along a border
@@ -58,7 +58,7 @@ class TileRoute:
         return sorted(covering, key=lambda served: served.tile.distance_m(*position))
 
     def covers(self, served: ServedTile, index: int) -> bool:
-        """Whether picture ``index`` may be sent to ``served``, which may be of an older route."""
+        """Return whether picture ``index`` may be sent to a tile, also one of an older route."""
         return served.tile.reaches(*self._positions[index % len(self)])
 
     def ahead(self, index: int, pictures: int) -> list[ServedTile]:
@@ -82,7 +82,7 @@ def _stays(tile: Tile, position: Position) -> bool:
 
 
 class HandoverCause(StrEnum):
-    """Why another tile takes a picture than took the one before."""
+    """Why a picture goes to another tile than the one before."""
 
     TILE = "tile"
     SERVER_LOST = "server_lost"

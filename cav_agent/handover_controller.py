@@ -38,17 +38,17 @@ __all__ = ["HandoverController", "OpenStream", "PrepareStream", "TileStream"]
 log = structlog.get_logger()
 
 NEAR_S, NEAR_PICTURES = 2.0, 3
-"""How long before a border the next stream is opened; in lockstep, how many pictures."""
+"""Time before a border at which the next stream is opened; in lockstep, number of pictures."""
 
 AHEAD_S, AHEAD_PICTURES = 30.0, 30
-"""How long before a border the next field is fetched; in lockstep, how many pictures."""
+"""Time before a border at which the next field is fetched; in lockstep, number of pictures."""
 
 SHORTEST_REST_S = 0.001
 POLL_S = 0.25
 """A stream that breaks between two pictures is noticed within this time."""
 
 FIRST_RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
-"""Until a stream that failed is opened again: longer with every failure in a row."""
+"""Pauses before a stream that failed is opened again: longer with every failure in a row."""
 
 OpenStream = Callable[[StreamOwner], StreamClient]
 """Returns a client for a new stream to a tile that was prepared."""
@@ -60,8 +60,8 @@ PrepareStream = Callable[[ServedTile], Awaitable[OpenStream]]
 class HandoverController:
     """Drives along ``positions`` across the tiles that ``tiles_published`` names.
 
-    It owns every stream: each result passes here once, is counted, and goes on to ``schedule`` and
-    ``observer``. ``changed`` is set by whoever has something new for its loop, such as a picture.
+    It owns every stream: each result is counted here once, and passed on to ``schedule`` and
+    ``observer``. ``changed`` is set to wake its loop, for example when a live picture has arrived.
     """
 
     def __init__(
@@ -295,12 +295,12 @@ class TileStream:
 
     @property
     def is_streaming(self) -> bool:
-        """Whether the server has welcomed the vehicle and takes pictures."""
+        """Return whether the server has welcomed the vehicle and takes pictures."""
         return self.client is not None and self.client.is_streaming
 
     @property
     def is_draining(self) -> bool:
-        """Whether the server is draining: it takes pictures until another one does."""
+        """Return whether the server is draining: it takes pictures until another one does."""
         return self.client is not None and self.client.is_draining
 
     @property
@@ -340,7 +340,7 @@ class TileStream:
             client.stop()
 
     def withdraw(self) -> None:
-        """Let a picture go that waits for a server which does not answer: another takes over."""
+        """Drop a picture that waits for a server which does not answer: another takes over."""
         if self.client is not None and not self.client.is_streaming:
             self.client.withdraw()
 

@@ -1,11 +1,11 @@
-"""Which of a tile's fields frames are coded against: the one whose light they were taken in.
+"""Chooses which of a tile's fields a frame is coded against: the one of the frame's light.
 
 A frame fits a field if the median of the differences between the block means of frame and render is
-small: 0 or 1 level on the yardstick street at noon, vehicles included, 36 to 47 with the field of
-noon at dusk. While the field in use fits, nothing else is looked at; when it does not, the tile's
-other lights are asked for, and those that are there are rendered beside it for one frame in
-``LOOK_EVERY``. Another one is taken if it is clearly nearer, so that two lights between which the
-day is do not take turns.
+small: 0 or 1 level on the sample street at noon, vehicles included, 36 to 47 with the field of
+noon at dusk. While the field in use fits, no other is tried. When it does not, the tile's other
+lights are fetched, and those that are there are rendered beside it for one frame in ``TRY_EVERY``.
+Another one is taken if it is clearly nearer, so that two lights that fit about equally do not take
+turns.
 
 A vehicle that has not fetched the tile's own field yet begins with a part of it, or with another
 field, the tile's preview; ``take_own`` puts more of it in the place of that between two frames. A
@@ -33,17 +33,16 @@ log = structlog.get_logger()
 FITS_LEVELS = 6.0
 """A median difference up to which a field is taken to be in the frame's light."""
 NEARER_LEVELS = 3.0
-"""By how much another light must be nearer."""
-LOOK_EVERY = 5
+"""Levels by which another light must be nearer."""
+TRY_EVERY = 5
 
 
 class TileLights:
-    """The fields of one tile that were opened; frames are coded against ``current``.
+    """The opened fields of one tile; frames are coded against ``current``.
 
-    ``own_id``: the tile's own field, if it is not ``field``, which is drawn until that is there.
-    ``want`` is called, on the thread that codes frames, each time the field in use does not fit and
-    there may be lights that were not fetched. ``add`` and ``take_own`` may be called on another
-    thread.
+    ``own_id``: the tile's own field, if it is not ``field``, which is drawn until that has arrived.
+    ``want`` is called, on the thread that codes frames, each time that the field in use does not
+    fit and further lights may be fetched. ``add`` and ``take_own`` may be called on other threads.
     """
 
     def __init__(
@@ -57,7 +56,7 @@ class TileLights:
         self._want = want
         self._lock = threading.Lock()
         self._fields: dict[str, RadianceField] = {field.field_id: field}
-        self._until_look = 0
+        self._until_try = 0
         self._arrived: RadianceField | None = None
 
     @property
@@ -66,13 +65,13 @@ class TileLights:
         return "" if self.current.field_id == self._own_id else self.current.field_id
 
     def add(self, field: RadianceField) -> None:
-        """Offer another light; the next frame that does not fit looks at it."""
+        """Offer another light; it is tried with the next frame that does not fit."""
         with self._lock:
             self._fields[field.field_id] = field
-            self._until_look = 0
+            self._until_try = 0
 
     def take_own(self, field: RadianceField) -> None:
-        """Have the next frame drawn from ``field`` in place of the one that was begun with."""
+        """Draw the next frame from ``field`` in place of the one in its stead."""
         with self._lock:
             self._arrived = field
 
@@ -82,36 +81,38 @@ class TileLights:
             return frozenset(self._fields)
 
     def render(self, camera: Camera, quality: Quality) -> View:
-        """Render the field in use: what a camera is found in, on any thread.
+        """Render the field in use, on any thread, for the search of a camera.
 
-        A preview stays in use: its place is taken by ``view`` alone.
+        A preview stays in use: only ``view`` puts the own field in its place.
         """
         return self.current.render(camera, quality)
 
     def drawable(self, quality: Quality) -> Quality:
-        """Return ``quality``, less detailed if the field in use is only there in part: what
-        ``view`` is to be asked for next, on the same thread."""
+        """Return the quality to call ``view`` with next, on the same thread.
+
+        It is less detailed than ``quality`` while only a part of the field in use has arrived.
+        """
         most = self._taken().most_detail
         return quality if quality.detail <= most else replace(quality, detail=most)
 
     def view(self, frame: I420, camera: Camera, quality: Quality) -> FieldView:
-        """Return what the field that fits shows at a frame's camera."""
+        """Render the field that fits at a frame's camera."""
         return self.fitting(frame, render_field_view(self._taken(), camera, quality), quality)
 
     def fitting(self, frame: I420, view: FieldView, quality: Quality) -> FieldView:
-        """Return ``view``, which the field in use shows, or what a light that is nearer does."""
-        if self._until_look > 0:
-            self._until_look -= 1
+        """Return ``view``, which is the field in use, or the view of a light that is nearer."""
+        if self._until_try > 0:
+            self._until_try -= 1
             return view
         difference = median_block_mean_difference(frame, view.render)
-        self._until_look = LOOK_EVERY - 1
+        self._until_try = TRY_EVERY - 1
         if difference <= FITS_LEVELS:
             return view
         self._want()
         return self._nearest(frame, view, difference, quality)
 
     def _taken(self) -> RadianceField:
-        """Return the current field, after the tile's own took the place of its preview.
+        """Return the current field, once the tile's own has taken the place of its preview.
 
         Called on the thread that codes frames, so that none changes between its render and name.
         """
@@ -120,7 +121,7 @@ class TileLights:
             if own is not None:
                 del self._fields[before.field_id]
                 self._fields[own.field_id] = self.own = own
-                self._arrived, self._until_look = None, 0
+                self._arrived, self._until_try = None, 0
                 self.current = own if self.current is before else self.current
                 log.info(
                     "own field taken",

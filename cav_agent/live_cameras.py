@@ -1,8 +1,8 @@
 """The live cameras of a vehicle: their newest frames, posed for a tile, and when they are coded.
 
 Poses come from the pose feed, or from the trajectory in ``camera.toml`` at the picture's time: Unix
-time for a camera, time from the first frame on for a video file. Only a trajectory tells which
-tiles lie ahead.
+time for a camera, time from the first frame on for a video file. Only a trajectory says which tiles
+lie ahead.
 
 Cameras of a rig that are not synchronised send at the same rate with different phases. An instant
 is due when every camera that has sent lately has a new frame, or half a period after the first of
@@ -44,7 +44,7 @@ NOWHERE: tuple[Position, ...] = ((0.0, 0.0),)
 
 
 class TrajectoryPoses(PoseSource):
-    """Where the camera is in one tile, by the trajectory of its ``camera.toml``."""
+    """The camera's poses in one tile, by the trajectory of its ``camera.toml``."""
 
     def __init__(self, poses: RecordedPoses, origin: TileOrigin) -> None:
         self._poses, self._origin = poses, origin
@@ -92,7 +92,7 @@ class LiveCamera:
         return (frame.pts_ns or 0) if self._is_file else frame.time_ns
 
     def capture(self, camera: VehicleCamera, index: int, instant: int) -> Capture:
-        """Take the newest frame; ``LiveSchedule`` says that there is one."""
+        """Take the newest frame; the schedule has checked that there is one."""
         frame = self.source.take()
         if frame is None:
             raise InvalidInput("source", "has no new frame")
@@ -115,7 +115,7 @@ class LiveCamera:
 
 
 class InstantClock:
-    """When the cameras of a rig are due, from which of them have a new frame; without clock.
+    """Decides when the cameras of a rig are due, from which of them have a new frame.
 
     ``rate_hz``: the rate at which they are coded.
     """
@@ -148,7 +148,7 @@ class InstantClock:
 
 
 class LiveSchedule:
-    """An instant whenever the cameras are due, no more often than the server's limit allows.
+    """Captures an instant whenever the cameras are due and the server's limit allows it.
 
     Its index is ``place`` of one of its frames: the place on the reference camera's trajectory.
     """
@@ -185,7 +185,7 @@ class LiveSchedule:
 
     @property
     def finished(self) -> bool:
-        """Whether every camera is a file that has come to its end."""
+        """Return whether every camera is a file that has come to its end."""
         return all(source.is_over and source.newest is None for source in self._sources)
 
     def _received_s(self) -> list[float | None]:
@@ -228,7 +228,7 @@ class LiveCameras:
 
     @property
     def knows_route(self) -> bool:
-        """Whether it is known which tiles the vehicle passes."""
+        """Return whether it is known which tiles the vehicle passes."""
         return self._trajectory is not None
 
     @property

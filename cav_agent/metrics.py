@@ -45,7 +45,7 @@ class AgentMetrics:
         )
         self.notices = make.counter(
             "rfedge_agent_notices",
-            "Notices of the street that servers sent, by what they tell of: object, map, light.",
+            "Notices of the street that servers sent, by their subject: object, map, light.",
             ("kind",),
         )
         for kind in NOTICE_KINDS:
@@ -91,7 +91,7 @@ class AgentMetrics:
         )
         self._feed_offset = make.gauge(
             "rfedge_agent_pose_feed_offset_seconds",
-            "What to add to the pose feed's times to get the camera's, as tracking tells it.",
+            "What to add to the pose feed's times to get the camera's, as found by tracking.",
         )
         self._crf = make.gauge("rfedge_agent_crf", "CRF of the last coded frame, 1 (best) to 51.")
         self._target = make.gauge(
@@ -163,7 +163,7 @@ class AgentMetrics:
         )
         self.feed_problems = make.counter(
             "rfedge_agent_pose_feed_problems",
-            "What was wrong with the pose feed, by reason; the log tells each once.",
+            "What was wrong with the pose feed, by reason; the log has each once.",
             ("reason",),
         )
         for problem in FeedProblem:

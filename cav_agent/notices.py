@@ -1,4 +1,4 @@
-"""Hands a server's notices of the street to other programs of the vehicle, as lines of JSON.
+"""Sends a server's notices of the street to other programs of the vehicle, as lines of JSON.
 
 Readers connect to a Unix socket that this user alone may open (``--notices PATH``) and get a line
 for each notice from then on::
@@ -10,7 +10,7 @@ for each notice from then on::
 
 ``kind`` is object, map or light; the names of the rest are those of ``rfcore.wire.notices``. A
 notice replaces an earlier one of its number. A reader that leaves ``MAX_UNREAD_BYTES`` unread is
-let go, so that none delays the vehicle.
+disconnected, so that none delays the vehicle.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ log = structlog.get_logger()
 MAX_UNREAD_BYTES = 64 << 10
 MOST_READERS = 8
 MAX_PATH_BYTES = 107
-"""Of a Unix socket's name: see unix(7)."""
+"""Longest name of a Unix socket: see unix(7)."""
 
 
 def notice_line(notice: StreetNotice, received_ns: int) -> dict[str, Any]:
-    """Return what readers are told."""
+    """Return the line that readers get."""
     return {
         "notice_id": notice.notice_id,
         "valid_for_s": notice.valid_for_s,
@@ -96,7 +96,7 @@ class NoticeSocket:
                 reader.write(line)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Hold a reader until it leaves; what it says is read and ignored."""
+        """Keep a reader connected until it leaves; what it sends is ignored."""
         if len(self._readers) >= MOST_READERS:
             log.warning("reader of notices refused", limit=MOST_READERS)
             writer.close()
@@ -113,7 +113,7 @@ class NoticeSocket:
 
 
 def _make_room(path: Path) -> None:
-    """Remove a socket that nobody listens at any more."""
+    """Remove a socket at which no program listens any more."""
     if len(bytes(path)) > MAX_PATH_BYTES:
         raise InvalidInput("notices", f"{path} has more than {MAX_PATH_BYTES} bytes; shorten it")
     try:

@@ -1,4 +1,4 @@
-"""How long a network path takes for a packet, from when packets were sent and answered.
+"""Estimates how long a network path takes for a packet, from when others were sent and answered.
 
 A packet of B bytes is answered ``min_rtt + B * cost`` after the packets before it were delivered:
 ``min_rtt`` is propagation, the answer's way back and the receiver's own time, ``cost`` the time of
@@ -32,17 +32,17 @@ MIN_RTT_WINDOW_NS = 10_000_000_000
 """Routes and radio cells change; a shortest round trip older than 10 s is forgotten."""
 
 DELIVERY_SAMPLES = 8
-"""Answers that tell what the path carries: most of a second at 10 Hz."""
+"""Answers from which the rate is estimated: most of a second at 10 Hz."""
 
 MEAN_MEMORY = 0.7
 """Weight of the running mean so far, when an answer comes."""
 
 TELLING_SIZE = 0.5
-"""Share of the mean size from which one packet alone may tell the cost: jitter drowns less."""
+"""Share of the mean size from which one packet alone may raise the cost; less drowns in jitter."""
 
 
 @dataclass(frozen=True)
-class _InFlight:
+class PacketInFlight:
     """A packet without an answer yet."""
 
     size_bytes: int
@@ -50,8 +50,8 @@ class _InFlight:
 
 
 @dataclass(frozen=True)
-class _DeliverySample:
-    """An answered packet; ``rtt_ns`` does not hold the wait behind the packets before it."""
+class DeliverySample:
+    """An answered packet; ``rtt_ns`` excludes the wait behind the packets before it."""
 
     size_bytes: int
     rtt_ns: int
@@ -59,15 +59,15 @@ class _DeliverySample:
 
 
 class PathEstimator:
-    """Tell it of every packet ``sent``, and of its answer or its loss; ask it for ``room_bytes``.
+    """Estimates from the packets ``sent``, ``answered`` and ``lost`` the ``room_bytes`` of others.
 
-    Packets are answered in the order they were sent; ``key`` names one.
+    Packets are answered in the order in which they were sent; ``key`` names one.
     """
 
     def __init__(self) -> None:
-        self._in_flight: dict[Hashable, _InFlight] = {}
-        self._samples: deque[_DeliverySample] = deque(maxlen=DELIVERY_SAMPLES)
-        self._shortest: deque[_DeliverySample] = deque()
+        self._in_flight: dict[Hashable, PacketInFlight] = {}
+        self._samples: deque[DeliverySample] = deque(maxlen=DELIVERY_SAMPLES)
+        self._shortest: deque[DeliverySample] = deque()
         """Samples of the window that none after them undercuts: the first has the minimum."""
         self._answered_ns: int | None = None
         self._mean_bytes = 0.0
@@ -92,30 +92,32 @@ class PathEstimator:
         return max(8e9 * sample.size_bytes / max(sample.rtt_ns, 1) for sample in self._samples)
 
     def sent(self, key: Hashable, size_bytes: int, now_ns: int) -> None:
-        """A packet of ``size_bytes`` went out."""
+        """Note that a packet of ``size_bytes`` went out."""
         if size_bytes < 1:
             raise InvalidInput("packet.size_bytes", f"{size_bytes} must be at least 1")
-        self._in_flight[key] = _InFlight(size_bytes, now_ns)
+        self._in_flight[key] = PacketInFlight(size_bytes, now_ns)
 
     def grew(self, key: Hashable, size_bytes: int, idle_ns: int) -> None:
-        """``size_bytes`` more went out that count as one packet with ``key``, after the path had
-        nothing of it to carry for ``idle_ns``."""
+        """Note ``size_bytes`` more that count as one packet with ``key``.
+
+        They went out after the path had nothing of it to carry for ``idle_ns``.
+        """
         packet = self._in_flight[key]
-        whole = _InFlight(packet.size_bytes + size_bytes, packet.sent_ns + idle_ns)
+        whole = PacketInFlight(packet.size_bytes + size_bytes, packet.sent_ns + idle_ns)
         self._in_flight[key] = whole
 
     def lost(self, key: Hashable) -> None:
-        """No answer will come, or one that says nothing of the path; unknown keys are ignored."""
+        """Forget a packet: no answer will come, or one that says nothing of the path."""
         self._in_flight.pop(key, None)
 
     def answered(self, key: Hashable, now_ns: int) -> None:
-        """The answer to ``key`` came; unknown keys are ignored."""
+        """Note that the answer to ``key`` came; unknown keys are ignored."""
         packet = self._in_flight.pop(key, None)
         if packet is None:
             return
         rtt_ns = max(1, now_ns - self._start_ns(packet, self._answered_ns))
         self._answered_ns = now_ns
-        self._add(_DeliverySample(packet.size_bytes, rtt_ns, now_ns))
+        self._add(DeliverySample(packet.size_bytes, rtt_ns, now_ns))
 
     def room_bytes(self, ready_ns: int, due_ns: int, now_ns: int) -> float:
         """Return how large a packet sent at ``ready_ns`` may be to be answered by ``due_ns``.
@@ -135,7 +137,7 @@ class PathEstimator:
         cost, _ = self._outlook(now_ns)
         return interval_ns / cost if cost else float("inf")
 
-    def _add(self, sample: _DeliverySample) -> None:
+    def _add(self, sample: DeliverySample) -> None:
         if self._outdates_others(sample):
             self._samples.clear()
         self._samples.append(sample)
@@ -148,8 +150,8 @@ class PathEstimator:
         self._mean_bytes = keep * self._mean_bytes + (1 - keep) * sample.size_bytes
         self._mean_rtt_ns = keep * self._mean_rtt_ns + (1 - keep) * sample.rtt_ns
 
-    def _outdates_others(self, sample: _DeliverySample) -> bool:
-        """Tell whether a packet no larger than an earlier one took twice its time or more."""
+    def _outdates_others(self, sample: DeliverySample) -> bool:
+        """Return whether a packet no larger than an earlier one took twice its time or more."""
         return any(
             other.size_bytes >= sample.size_bytes and 2 * other.rtt_ns <= sample.rtt_ns
             for other in self._samples
@@ -177,7 +179,7 @@ class PathEstimator:
                 free_ns = now_ns + overdue_ns
         return cost, now_ns if free_ns is None else free_ns
 
-    def _start_ns(self, packet: _InFlight, before_ns: int | None) -> int:
+    def _start_ns(self, packet: PacketInFlight, before_ns: int | None) -> int:
         """Return when the path began with ``packet``: when it was sent, or when the packet before
         it, answered at ``before_ns``, had left the bottleneck."""
         if before_ns is None:

@@ -60,12 +60,12 @@ class WaitingInstants:
 
     @property
     def waiting_since_s(self) -> float | None:
-        """When the oldest instant that has not begun was captured."""
+        """Return when the oldest instant that has not begun was captured."""
         return min(c.captured_s for c in self._waiting[0]) if self._waiting else None
 
     @property
     def is_begun(self) -> bool:
-        """Whether pictures of an instant that was begun are left."""
+        """Return whether pictures of an instant that was begun are left."""
         return bool(self._begun)
 
     def offer(self, captures: tuple[Capture, ...]) -> list[Capture]:
@@ -126,7 +126,7 @@ class WaitingInstants:
 
 
 class AnswerTimeout:
-    """How long to wait for an answer: at most ``limits.answer_s``, as for the first one."""
+    """Limits the wait for an answer: to ``limits.answer_s`` at most, as for the first one."""
 
     def __init__(self, limits: AgentLimits) -> None:
         self._limits = limits
@@ -182,7 +182,7 @@ class FramesInFlight:
     def add(
         self, address: FrameAddress, result: FrameResult, base: FrameAddress | None, now: float
     ) -> None:
-        """Take a frame that was encoded ``now``."""
+        """Add a frame that was encoded ``now``."""
         in_flight_bytes = sum(frame.result.packet_bytes for frame in self._frames.values())
         timeout_s = self._timeout.timeout_s(in_flight_bytes + result.packet_bytes)
         self._frames[address] = FrameInFlight(result, base, now, timeout_s)
@@ -195,7 +195,7 @@ class FramesInFlight:
         self._frames[address] = replace(self._frames[address], sent_s=now)
 
     def instant_of(self, address: FrameAddress) -> int:
-        """Return which instant of a rig a frame belongs to; 0: it stands alone."""
+        """Return the instant of a rig that a frame belongs to; 0: its camera is alone."""
         return self._frames[address].result.capture.instant
 
     def pop(self, address: FrameAddress) -> FrameInFlight:
@@ -203,7 +203,7 @@ class FramesInFlight:
         return self._frames.pop(address)
 
     def acked(self, ack: Ack, now: float) -> FrameInFlight | None:
-        """Fill in what ``ack`` says of its frame and return it; None if it is not in flight."""
+        """Complete the frame of ``ack`` and return it; None if it is not in flight."""
         frame = self._frames.get(ack.address)
         if frame is None:
             return None
@@ -242,7 +242,7 @@ def _covers(nack: Nack, address: FrameAddress) -> bool:
 
 
 class PredictionChain:
-    """Which epoch the next packet is numbered in, and which frame it is predicted from."""
+    """Keeps the epoch of the next packet, and the frame that it is predicted from."""
 
     def __init__(self, first_epoch: int) -> None:
         self.epoch = first_epoch
@@ -252,24 +252,24 @@ class PredictionChain:
         self._epoch_used = False
 
     def started(self) -> None:
-        """A packet of this epoch is being encoded."""
+        """Note that a packet of this epoch is being encoded."""
         self._epoch_used = True
 
     def sent(self, address: FrameAddress) -> None:
-        """A frame was sent: the next is predicted from it."""
+        """Note that a frame was sent: the next is predicted from it."""
         self.base = address
 
     def decoded(self, address: FrameAddress) -> None:
-        """The server has decoded a frame to the sender's own picture."""
+        """Note that the server has decoded a frame to the sender's own picture."""
         self._decoded = address
 
     def unknown_to_server(self, base: FrameAddress | None) -> None:
-        """The server no longer has the frame ``base``."""
+        """Note that the server no longer has the frame ``base``."""
         if base == self._decoded:
             self._decoded = None
 
     def forget(self) -> None:
-        """Another connection begins: its server has decoded nothing."""
+        """Forget what was decoded: another connection begins."""
         self._decoded = None
 
     def restart(self, above: int = -1) -> None:

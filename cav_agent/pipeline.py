@@ -1,9 +1,9 @@
-"""From a captured picture to a packet: convert, render, encode. Runs on the encoder's thread.
+"""Turns a captured picture into a packet: convert, render, encode. Runs on the encoder's thread.
 
-A vehicle's camera hands its picture over in memory. Here it comes from a dataset, so it is loaded
-before any timing of the sender starts. The encoder's state is a value. Its numbering starts afresh
-whenever the session asks for another epoch; the frames it made last are kept, so that the session
-can say from which one to go on.
+A vehicle's camera delivers its picture in memory. A dataset's picture is loaded before any timing
+of the sender starts. The encoder's state is a value. Its numbering starts afresh with each epoch
+that the session begins; the last frames are kept, so that the session can choose which one to
+predict from.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ ClockNs = Callable[[], int]
 
 @dataclass(frozen=True)
 class PipelineOptions:
-    """How frames are coded beyond the codec's configuration."""
+    """Options of coding beyond the codec's configuration."""
 
     limit_bytes: int = MAX_PAYLOAD_BYTES
     """A larger slice is coded again at a higher CRF, as long as there is one."""
@@ -99,7 +99,7 @@ class Pipeline:
 
     @property
     def header(self) -> StreamHeader:
-        """What the server needs before the first packet."""
+        """Return what the server needs before the first packet."""
         return self._encoder.header
 
     def encode(self, job: EncodeJob) -> EncodedFrame:

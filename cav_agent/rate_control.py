@@ -1,4 +1,4 @@
-"""How many bytes the next frame may have, so that its answer comes within a delay.
+"""Limits the bytes of the next frame so that its answer comes within a delay.
 
 The delay runs from capture to Ack, as ``rfedge_agent_capture_to_ack_seconds`` measures it: waiting,
 rendering, coding, the uplink, the server's work and the downlink. Quality falls first: a frame gets
@@ -49,9 +49,9 @@ LIMIT = 1.5
 """A slice of more than this many times its target is coded again."""
 
 SHRINK, GROW = 0.7, 0.004
-"""How the share of the room that is used changes: times 0.7 when a frame was late (unless it was
-coded before the last cut), plus 0.004 for each in time. They balance at 1 late frame in 100: 0.3 of
-any share up to 1 against 99 times 0.004."""
+"""The share of the room that is used shrinks to 0.7 of itself when a frame was late (unless it was
+coded before the last cut), and grows by 0.004 for each in time. They balance at 1 late frame in
+100: 0.3 of any share up to 1 against 99 times 0.004."""
 LEAST_SHARE = 0.1
 
 MEMORY = 0.75
@@ -69,8 +69,9 @@ OVERHEAD_BYTES = 150
 
 @dataclass(frozen=True)
 class ByteBudget:
-    """The bytes a slice is to have: ``target_bytes``; above ``limit_bytes`` it is coded again.
+    """The bytes that a slice may have.
 
+    It aims at ``target_bytes``; a slice above ``limit_bytes`` is coded again.
     ``rate_bps``: what answers have proven the path to carry; None before the first one.
     """
 
@@ -79,7 +80,7 @@ class ByteBudget:
     rate_bps: float | None = None
 
     def with_target(self, target_bytes: float) -> ByteBudget:
-        """Return the budget of a camera that gets so much of this one."""
+        """Return the budget of a camera that gets this part of it."""
         return replace(self, target_bytes=target_bytes, limit_bytes=int(LIMIT * target_bytes))
 
 
@@ -94,7 +95,7 @@ class InstantInFlight:
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more will be sent or answered."""
+        """Return whether nothing more will be sent or answered."""
         return not (self.unsent > 0 or self.unanswered)
 
 
@@ -116,14 +117,14 @@ class RateControl:
         self._instant_of: dict[FrameAddress, Hashable] = {}
 
     def captured(self, now: float) -> None:
-        """A picture was captured, or those of an instant."""
+        """Note that a picture was captured, or those of an instant."""
         if self._captured_s is not None:
             interval_s = now - self._captured_s
             self._interval_s = _mean(self._interval_s, interval_s)
         self._captured_s = now
 
     def is_late(self, captured_s: float, now: float) -> bool:
-        """Whether a picture has waited so long that not even an empty frame would be in time."""
+        """Return whether a picture has waited so long that even an empty frame would be late."""
         least_s = self._work_s + self._path.min_rtt_ns / 1e9
         left_s = self._max_delay_s - least_s
         return now - captured_s > (left_s if left_s > 0 else self._max_delay_s)
@@ -131,7 +132,7 @@ class RateControl:
     def budget(self, captured_s: float, now: float, pictures: int = 1) -> ByteBudget | None:
         """Return the bytes for the pictures of ``captured_s`` together if coding begins ``now``.
 
-        ``pictures``: how many there are, of one instant. None while they should wait for an answer.
+        ``pictures``: how many of one instant. None while they should wait for an answer.
         """
         room = self._room_bytes(captured_s, now, 1.0, pictures)
         if self._path.bytes_in_flight and room < LEAST_BYTES * pictures:
@@ -144,8 +145,11 @@ class RateControl:
         return ByteBudget(target, int(LIMIT * target), self._path.rate_bps)
 
     def _room_bytes(self, captured_s: float, now: float, share: float, pictures: int) -> float:
-        """Return how long the slices of an instant may be to be answered within ``share`` of the
-        delay: sending begins when the first is coded, and the last has its part of the room."""
+        """Return the bytes that slices of an instant may have together to be answered in time.
+
+        In time is within ``share`` of the delay. Sending begins when the first is coded, and the
+        last has its part of the room.
+        """
         due_ns, now_ns = _ns(captured_s + share * self._max_delay_s), _ns(now)
         first, last = (
             self._path.room_bytes(_ns(now + coded * self._work_s), due_ns, now_ns)
@@ -154,12 +158,12 @@ class RateControl:
         return min(first, pictures * last) - pictures * self._overhead_bytes
 
     def coded(self, sender_s: float, payload_bytes: int, packet_bytes: int) -> None:
-        """A frame took the sender ``sender_s`` from the picture to the packet."""
+        """Note that a frame took the sender ``sender_s`` from the picture to the packet."""
         self._work_s = _mean(self._work_s or None, sender_s)
         self._overhead_bytes = _mean(self._overhead_bytes, packet_bytes - payload_bytes)
 
     def begun(self, instant: int, pictures: int) -> None:
-        """So many pictures of a rig's instant will be coded; 0: of a camera that stands alone."""
+        """Note that so many pictures of an instant will be coded; instant 0: of a camera alone."""
         for key in [key for key, other in self._instants.items() if not other.unanswered]:
             self._path.lost(key)
             del self._instants[key]
@@ -167,7 +171,7 @@ class RateControl:
             self._instants[instant] = InstantInFlight(pictures)
 
     def sent(self, address: FrameAddress, packet_bytes: int, now: float, instant: int = 0) -> None:
-        """A frame was sent, of a rig's ``instant`` or of a camera that stands alone."""
+        """Note that a frame was sent, of a rig's ``instant`` or (0) of a camera alone."""
         key: Hashable = instant or address
         frames = self._instants.setdefault(key, InstantInFlight(1))
         if frames.unanswered:
@@ -181,14 +185,14 @@ class RateControl:
         self._instant_of[address] = key
 
     def not_sent(self, instant: int) -> None:
-        """A frame of an instant was not sent after all."""
+        """Note that a frame of an instant was not sent after all."""
         frames = self._instants.get(instant)
         if frames is not None:
             frames.unsent -= 1
             self._close(instant, frames)
 
     def answered(self, address: FrameAddress, latency_s: float, now: float) -> None:
-        """A frame was answered ``latency_s`` after its capture, by Ack or Nack."""
+        """Note an answer, by Ack or Nack, ``latency_s`` after the frame's capture."""
         key = self._instant_of.pop(address, None)
         if key is None:
             self._adapt(latency_s, now)
@@ -200,7 +204,7 @@ class RateControl:
         self._close(key, frames)
 
     def lost(self, address: FrameAddress) -> None:
-        """No answer to a frame will come: of its instant no time can be told."""
+        """Note that no answer to a frame will come: its instant gives no time."""
         key = self._instant_of.pop(address, None)
         if key is None:
             return
@@ -210,7 +214,7 @@ class RateControl:
         self._close(key, frames)
 
     def _close(self, key: Hashable, frames: InstantInFlight) -> None:
-        """Learn of the path from an instant that is over."""
+        """Learn about the path from an instant that is over."""
         if not frames.is_over:
             return
         del self._instants[key]
@@ -241,14 +245,14 @@ class BitDivision:
         self._complexity: dict[str, float] = {}
 
     def coded(self, camera_id: str, payload_bytes: int, crf: float) -> None:
-        """A frame of a camera took so many bytes at ``crf``."""
+        """Note that a frame of a camera took so many bytes at ``crf``."""
         found = max(1, payload_bytes) * 2 ** (crf / HALVING_CRF)
         self._complexity[camera_id] = _mean(self._complexity.get(camera_id), found)
 
     def divide(self, total_bytes: float, camera_ids: Sequence[str]) -> dict[str, float]:
         """Return the bytes of each camera; they sum to ``total_bytes``.
 
-        A camera of which nothing was coded yet counts as complex as the mean of the others.
+        A camera without a coded frame counts as complex as the mean of the others.
         """
         known = [self._complexity[c] for c in camera_ids if c in self._complexity]
         usual = sum(known) / len(known) if known else 1.0

@@ -1,7 +1,7 @@
-"""One server as the vehicle sees it: its address, the channel to it, and what it publishes.
+"""The vehicle's connection to one server: address, channel, and the tiles that it publishes.
 
-Every stream and every fetch of a field to that server goes over this channel. Waiting for a server
-that does not answer says why: a refused certificate is not mistaken for a server that is away.
+Every stream and every fetch of a field goes over this channel. A wait that fails says why: a
+refused certificate is not mistaken for a server that is away.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 __all__ = ["WHOLE_STREET", "ServerConnection", "retry_after_s", "server_connections"]
 
 ASK_AFTER_S = 1.0
-"""A server that does not connect within this time is asked whether it refuses the handshake."""
+"""After this time without a connection, the vehicle checks whether the server refuses it."""
 
 REFUSED = (grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED)
 
 LIST_S = 10.0
-"""How long a connected server may take to list its tiles."""
+"""Longest time for a connected server to list its tiles."""
 
 LONGEST_RETRY_AFTER_S = 30.0
-"""A server that is full says when to try again; no longer than this is waited."""
+"""A server that is full says when to try again; the vehicle waits no longer than this."""
 
 WHOLE_STREET = "street"
 """Name of the only tile of a server that publishes none."""
@@ -42,7 +42,7 @@ WHOLE_STREET = "street"
 class ServerConnection:
     """A server's address and, inside ``async with``, the channel to it.
 
-    ``fields_changed`` is set when a stream is told that the server publishes other fields.
+    ``fields_changed`` is set when the server notifies a stream that it publishes other fields.
     ``metadata``, the vehicle's name, goes with calls for lists and archives, so that a proxy can
     place them where it places the vehicle's streams.
     """
@@ -165,7 +165,7 @@ def _tiles_of(listed: pb.ListFieldsResponse) -> tuple[Tile, ...]:
 
 
 def retry_after_s(error: grpc.aio.AioRpcError) -> float:
-    """Return how long a server that refused a call asks to be left alone; 0: it did not say."""
+    """Return the pause that a server asked for when it refused a call; 0: it did not say."""
     for key, value in error.trailing_metadata():
         if key == RETRY_AFTER and isinstance(value, str) and value.isdecimal():
             return min(int(value) / 1e3, LONGEST_RETRY_AFTER_S)

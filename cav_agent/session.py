@@ -1,10 +1,10 @@
 """The vehicle's side of one stream: a state machine without socket, clock or encoder.
 
 ``cav_agent.client`` moves bytes and time in and out of it. ``offer`` takes a captured picture, or
-those of one instant of a rig, into a slot where the newest wins; ``job_to_start`` hands one out for
-encoding when the server's credit allows; ``encoded`` brings the packet back; ``messages_to_send``
-has what goes up, ``receive`` takes what came down; ``get_timer`` says when ``handle_timer`` wants
-to be called; ``take_results`` tells how each picture ended.
+those of one instant of a rig, of which the newest wait; ``job_to_start`` returns one to encode when
+the server's credit allows; ``encoded`` brings the packet back; ``messages_to_send`` returns what
+goes to the server, ``receive`` takes what came from it; ``get_timer`` returns when ``handle_timer``
+is to be called; ``take_results`` returns how pictures ended.
 
 Each camera has its own epochs and credits, so what is wrong with one leaves the others alone.
 Pictures are dropped only before they are encoded. A frame is predicted from the one sent before it,
@@ -55,7 +55,7 @@ __all__ = ["AgentSession", "LinkState", "OutgoingMessage"]
 
 
 class LinkState(StrEnum):
-    """Where the conversation with the server is."""
+    """The state of the conversation with the server."""
 
     DISCONNECTED = "disconnected"
     GREETING = "greeting"
@@ -77,7 +77,7 @@ class OutgoingMessage:
 
 @dataclass
 class SendingCamera:
-    """What is known of one camera: which frames it predicts from, and how many it may send."""
+    """One camera's prediction chain, and how many frames it may send."""
 
     chain: PredictionChain
     granted: int = 0
@@ -85,7 +85,7 @@ class SendingCamera:
 
     @property
     def may_send(self) -> bool:
-        """Whether the server's credit allows another frame."""
+        """Return whether the server's credit allows another frame."""
         return self.used < self.granted
 
 
@@ -135,7 +135,7 @@ class AgentSession:
 
     @property
     def vehicle_id(self) -> str:
-        """Whose stream it is."""
+        """The vehicle's name."""
         return self._hello.vehicle_id
 
     @property
@@ -145,13 +145,13 @@ class AgentSession:
 
     @property
     def is_idle(self) -> bool:
-        """Whether no picture waits, is being encoded or is unanswered."""
+        """Return whether no picture waits, is being encoded or is unanswered."""
         return not (self._waiting or self._job or self._in_flight)
 
     # --- connection
 
     def connected(self, now: float) -> None:
-        """A stream is open: greet the server."""
+        """Greet the server on a stream that was opened."""
         self.state = LinkState.GREETING
         self.broken = None
         self.is_draining = False
@@ -163,7 +163,7 @@ class AgentSession:
         self._outbox.append(OutgoingMessage.of(self._hello))
 
     def connection_lost(self, end: StreamEnd, now: float) -> None:
-        """The stream is gone, and with it every frame that was not answered."""
+        """End every frame that was not answered, since its stream is gone."""
         self.state = LinkState.DISCONNECTED
         self._outbox.clear()
         for address in self._in_flight.addresses:
@@ -173,7 +173,7 @@ class AgentSession:
             camera.chain.restart()
 
     def abandon(self, end: StreamEnd, now: float) -> None:
-        """End every picture that was taken: nobody will encode or send any more of them."""
+        """End every picture that was taken: none of them will be encoded or sent any more."""
         for capture in self._waiting.clear():
             self._results.append(FrameResult(capture, Outcome.LOST, end.reason, end.problem))
         if self._job is not None:
@@ -181,7 +181,7 @@ class AgentSession:
             self._results.append(FrameResult(capture, Outcome.LOST, end.reason, end.problem))
         self.connection_lost(end, now)
 
-    # --- what comes down
+    # --- messages from the server
 
     def receive(self, message: ServerMessage, now: float) -> None:
         """Take one message of the server."""
@@ -224,7 +224,7 @@ class AgentSession:
             _restart_after(nack, self._cameras[camera_id].chain)
 
     def _end_refused(self, nack: Nack, now: float) -> None:
-        """End the frames that ``nack`` is about; an overloaded server has not looked at them."""
+        """End the frames that ``nack`` is about; an overloaded server has not judged them."""
         overloaded = nack.reason is RejectReason.OVERLOADED
         outcome = Outcome.LOST if overloaded else Outcome.NACKED
         for address, frame in self._in_flight.refused_by(nack):
@@ -241,7 +241,7 @@ class AgentSession:
             self._rate_control.captured(captures[0].captured_s)
 
     def withdraw(self) -> None:
-        """Let go what waits for the encoder, to be captured again for another server."""
+        """Lose what waits for the encoder, to be captured again for another server."""
         for capture in self._waiting.clear():
             self._results.append(FrameResult(capture, Outcome.LOST, EndReason.HANDED_OVER))
 
@@ -302,7 +302,7 @@ class AgentSession:
             self._drop(self._waiting.drop_oldest(), EndReason.TOO_LATE)
 
     def encoded(self, encoded: EncodedFrame, now: float) -> None:
-        """The picture of the running job became ``encoded``: send it, if its stream still is."""
+        """Send the frame of the running job, if its stream still is the same."""
         job = self._take_job()
         frame = self._frame(job.capture, encoded)
         outgoing = OutgoingMessage.of(frame)
@@ -349,7 +349,7 @@ class AgentSession:
         return None
 
     def encoding_failed(self, error: RfedgeError) -> None:
-        """The picture of the running job could not be read or coded."""
+        """Drop the picture of the running job, which could not be read or coded."""
         capture = self._take_job().capture
         result = FrameResult(capture, Outcome.DROPPED, EndReason.NOT_CODED, str(error))
         self._results.append(result)
@@ -401,10 +401,10 @@ class AgentSession:
         else:
             self._rate_control.lost(address)
 
-    # --- what goes up, and time
+    # --- messages to the server, and time
 
     def messages_to_send(self, now: float) -> list[OutgoingMessage]:
-        """Return, once, what is to be written to the stream, which counts as sent ``now``."""
+        """Return, once, what is to be written to the stream; it counts as sent ``now``."""
         outgoing = list(self._outbox)
         self._outbox.clear()
         for entry in outgoing:
@@ -449,7 +449,7 @@ class AgentSession:
 
 
 def _restart_after(nack: Nack, chain: PredictionChain) -> None:
-    """Begin an epoch, unless it follows from a loss that a new one has answered already."""
+    """Begin an epoch, unless the refusal follows from a loss that began one already."""
     if nack.address.epoch < chain.epoch and nack.current_epoch <= chain.epoch:
         return
     chain.restart(nack.current_epoch)

@@ -28,7 +28,7 @@ __all__ = ["CameraTracking"]
 
 U8 = NDArray[np.uint8]
 SearchResult = tuple[Localised | Lost, TimedPose | None]
-"""What a search ended with, and where a later picture was taken, if that was looked for."""
+"""The end of a search, and the pose of a later picture, if that was searched for."""
 
 
 class CameraTracking:
@@ -79,7 +79,7 @@ class CameraTracking:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How often each event happened."""
+        """Return how often each event happened."""
         return {str(event): count for event, count in self._tracker.counts.items()}
 
     def _begin_search(self) -> None:
@@ -90,7 +90,7 @@ class CameraTracking:
             self._running = (job, self._searcher.submit(self._search, job))
 
     def _search(self, job: SearchJob) -> SearchResult:
-        """Run a search, on its own thread, and look for the picture that is the newest by then."""
+        """Run a search, on its own thread, and locate the picture that is the newest by then."""
         answer = self._localiser.localise_luma(job.luma, job.prior)
         newest = self._newest
         if isinstance(answer, Lost) or newest is None:

@@ -70,9 +70,9 @@ from rfcore.wire.tiles import Tile
 __all__ = ["SEARCH_NICENESS", "Vehicle", "yield_to_frames"]
 
 SEARCH_NICENESS = 5
-"""By how much the thread that searches poses yields: beside it frames take as long as alone (25 ms
-on two cores with other work; beside one of their own priority 45). At 10 they take no less, and
-other work keeps the search from ending."""
+"""Niceness of the thread that searches poses. Beside it frames take as long as alone: 25 ms on two
+cores with other work; beside a thread of their own priority they take 45. At 10 they take no less,
+and other work keeps the search from ending."""
 _NO_ROUTE = (
     "the street has several tiles, and a live camera without a trajectory does not say which of "
     "them it passes: name the one field with --field, or give [trajectory] in camera.toml"
@@ -81,14 +81,33 @@ _NO_ROUTE = (
 log = structlog.get_logger()
 
 FIRST_RETRY_S, LONGEST_RETRY_S = 0.5, 5.0
-"""Until a server that did not list its tiles is asked again. Vehicles learn from the list that a
-field was replaced, so it is asked for more often than a stream that was refused is opened."""
+"""Pauses before tiles that were not listed are requested again. The list shows that a field was
+replaced, so it is requested more often than a refused stream is opened."""
 
 
 class Vehicle:
     """Runs ``config`` from connecting to the end of the drive; ``stop`` ends it early.
 
     ``on_notice`` is called, on the event loop, with each notice that a server sends of the street.
+
+    >>> import asyncio, sys
+    >>> from pathlib import Path
+    >>> from cav_agent.config import AgentConfig, PaceKind
+    >>> from cav_agent.vehicle import Vehicle
+    >>> from mec_server.config import ServerConfig
+    >>> from mec_server.server import EdgeServer
+    >>> from rfcore.wire.settings import configure_logs
+    >>> fields, drive = Path("samples/fields"), Path("samples/street/transforms_drive_empty.json")
+    >>> async def drive_past_a_server():
+    ...     server = EdgeServer(ServerConfig(fields, "127.0.0.1:0"))
+    ...     await server.start()
+    ...     config = AgentConfig(str(server.address), drive, fields, pace=PaceKind.LOCKSTEP)
+    ...     counts = await Vehicle(config).run()
+    ...     await server.stop()
+    ...     return counts
+    >>> configure_logs(sys.stderr)
+    >>> asyncio.run(drive_past_a_server())
+    Counter({'acked': 24})
     """
 
     def __init__(

@@ -41,7 +41,7 @@ PRODUCER_TIME = struct.Struct("<q")
 """``AVProducerReferenceTime.wallclock``, microseconds of the Unix epoch: from sender reports."""
 KEPT_TIMES = 64
 EARLY_SHARE = 0.3
-"""Of a period: a frame that much too early is taken all the same, since cameras jitter."""
+"""Share of a period by which a frame may be too early and is still taken, since cameras jitter."""
 
 MAGIC = b"RFLV"
 FORMAT = struct.Struct("<4sIIIqqqqQ")
@@ -56,7 +56,7 @@ MAX_TEXT_BYTES = 4096
 class FrameRecord:
     """A decoded frame, uint8 [H, W, 3].
 
-    ``pts_ns``: its presentation time, of a file from its first frame on; ``None``: it has none.
+    ``pts_ns``: its presentation time, since the first frame of a file; ``None``: it has none.
     ``received_ns``: when it was decoded, Unix time. ``sender_ns``: when it was taken by the
     sender's clock, Unix time, ``None`` without a report. ``dropped``: frames left out so far.
     """
@@ -78,7 +78,7 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class EndRecord:
-    """The source ended, in words; ``is_whole``: a file, at its end."""
+    """The end of a source and its cause in words; ``is_whole``: a file was read to its end."""
 
     problem: str
     is_whole: bool = False
@@ -139,12 +139,12 @@ class Decoded:
 
     @property
     def time_ns(self) -> int:
-        """On the source's own clock, if it has one."""
+        """The time on the source's own clock, if it has one."""
         return self.received_ns if self.pts_ns is None else self.pts_ns
 
 
-class Newest:
-    """One frame between two threads; a newer one takes its place. ``end`` closes it."""
+class NewestFrame:
+    """Passes the newest frame from one thread to another; ``end`` closes it."""
 
     def __init__(self) -> None:
         self.dropped = 0
@@ -160,12 +160,12 @@ class Newest:
             self._changed.notify()
 
     def leave_out(self) -> None:
-        """Count a frame that is not wanted."""
+        """Count a frame that is left out."""
         with self._changed:
             self.dropped += 1
 
     def end(self, end: EndRecord) -> None:
-        """Say that no more come."""
+        """Announce that no more frames come."""
         with self._changed:
             self._end = end
             self._changed.notify()
@@ -183,7 +183,7 @@ def main() -> None:
     """Read the source that the one argument describes until it ends."""
     settings = ReaderSettings.of_json(sys.argv[1])
     Thread(target=_end_with_agent, daemon=True).start()
-    newest = Newest()
+    newest = NewestFrame()
     Thread(target=_decode, args=(settings, newest), daemon=True).start()
     while isinstance(taken := newest.take(), Decoded):
         rgb = rgb_from_video_frame(taken.frame)
@@ -210,9 +210,9 @@ def _write(*parts: bytes | memoryview) -> None:
         os._exit(1)
 
 
-def _decode(settings: ReaderSettings, newest: Newest) -> None:
+def _decode(settings: ReaderSettings, newest: NewestFrame) -> None:
     is_file = settings.address.kind is SourceKind.FILE
-    wanted = _EveryPeriod(settings.rate_hz)
+    wanted = FrameDecimator(settings.rate_hz)
     try:
         for decoded in _frames(settings):
             if decoded is not None and wanted.takes(decoded.time_ns):
@@ -224,7 +224,7 @@ def _decode(settings: ReaderSettings, newest: Newest) -> None:
         newest.end(EndRecord(f"{type(error).__name__}: {error}"))
 
 
-class _EveryPeriod:
+class FrameDecimator:
     """Takes frames at ``rate_hz`` on average, the first one after each multiple of the period."""
 
     def __init__(self, rate_hz: float) -> None:
@@ -292,7 +292,7 @@ def _decoded(packet: av.Packet[av.VideoStream]) -> Iterator[av.VideoFrame | None
 
 
 def _note_sender_time(packet: av.Packet[av.VideoStream], sent: dict[int, int]) -> None:
-    """Remember when the sender took a packet's picture, where RTCP sender reports tell."""
+    """Remember when the sender took a packet's picture, where RTCP sender reports say so."""
     if packet.pts is None or not packet.has_sidedata("prft"):
         return
     (wallclock_us,) = PRODUCER_TIME.unpack_from(bytes(packet.get_sidedata("prft")))

@@ -1,4 +1,4 @@
-"""The options of a live camera: what is opened, and what FFmpeg is told to open it with low delay.
+"""The options of a live camera: its address, and FFmpeg's options that open it with low delay.
 
 ==================================  ================================================================
 ``/dev/video0``, ``v4l2:DEVICE``    a camera of this machine, by Video4Linux2
@@ -39,11 +39,11 @@ __all__ = [
 LOW_DELAY = {"fflags": "nobuffer", "analyzeduration": "500000", "max_delay": "200000"}
 """Microseconds: probe half a second, and wait a fifth of one for RTP packets out of order."""
 RTP_BUFFER_BYTES = 1 << 20
-"""Of the socket: a key frame of a megapixel arrives in one burst."""
+"""Buffer of the socket: a key frame of a megapixel arrives in one burst."""
 
 
 class SourceKind(StrEnum):
-    """What a source is."""
+    """The kind of a source."""
 
     V4L2 = "v4l2"
     RTSP = "rtsp"
@@ -64,7 +64,7 @@ PROTOCOLS = {
 
 @dataclass(frozen=True)
 class SourceAddress:
-    """What FFmpeg opens: ``url``, by the demuxer ``format`` (``None``: it finds out)."""
+    """The ``url`` that FFmpeg opens by the demuxer ``format`` (``None``: FFmpeg finds out)."""
 
     kind: SourceKind
     url: str
@@ -73,7 +73,7 @@ class SourceAddress:
 
 
 def parse_address(text: str) -> SourceAddress:
-    """Return what ``text`` means; raise ``InvalidInput`` naming what is expected."""
+    """Return the parsed address; raise ``InvalidInput`` naming what is expected."""
     scheme, _, rest = text.partition("://")
     if text.startswith(("/dev/video", "v4l2:")):
         device = text.removeprefix("v4l2:")
@@ -129,7 +129,7 @@ WORD = re.compile(r"[a-z0-9_]{1,16}")
 
 
 class RtspTransport(StrEnum):
-    """How RTP comes from an RTSP server."""
+    """The transport of RTP from an RTSP server."""
 
     TCP = "tcp"
     UDP = "udp"
@@ -148,11 +148,11 @@ class LiveSettings:
     """Seconds without a frame after which a source is lost and opened again."""
     rtsp_transport: RtspTransport = RtspTransport.TCP
     v4l2_size: str | None = None
-    """WIDTHxHEIGHT that a V4L2 device is asked for; without it the size of camera.toml."""
+    """WIDTHxHEIGHT requested of a V4L2 device; without it the size of camera.toml."""
     v4l2_format: str | None = None
-    """Pixel format or codec a V4L2 device is asked for, such as mjpeg or yuyv422."""
+    """Pixel format or codec requested of a V4L2 device, such as mjpeg or yuyv422."""
     v4l2_rate: float | None = None
-    """Frames a second that a V4L2 device is asked for."""
+    """Frames a second requested of a V4L2 device."""
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.source_timeout_s <= 600:
@@ -181,7 +181,7 @@ class LiveSettings:
         return address
 
     def opened_for(self, size_px: tuple[int, int]) -> SourceAddress:
-        """Return the address for pictures of (width, height): a device is asked for that size."""
+        """Return the address for pictures of (width, height), requested of a device."""
         address = self.address
         if address.kind is not SourceKind.V4L2:
             return address
@@ -195,7 +195,10 @@ class LiveSettings:
 
 @dataclass(frozen=True)
 class ReaderSettings:
-    """``timeout_s``: for opening and for each read, where FFmpeg can be interrupted."""
+    """The settings of a reader's process.
+
+    ``timeout_s``: for opening and for each read, where FFmpeg can be interrupted.
+    """
 
     address: SourceAddress
     timeout_s: float

@@ -1,21 +1,21 @@
-"""A live source as the agent holds it: its reader's process kept going, and its newest frame.
+"""Keeps the reader's process of a live source running, and the newest frame of it.
 
-``LiveSource.step`` is a state machine that reads one record, or opens the source once it is due;
-its clocks and its reader are arguments. ``SourceThread`` is the thread that steps it. A source that
-says nothing for ``timeout_s`` is closed, which kills its process, and opened again after a pause
+``LiveSource.step`` is a state machine that reads one record, or opens the source when it is due;
+its clocks and its reader are arguments. ``SourceThread`` is the thread that steps it. A source
+without a frame for ``timeout_s`` is closed, which kills its process, and opened again after a pause
 that grows up to ``LONGEST_PAUSE_S``. There is one process and one thread at any time.
-``ReaderProcess`` starts it, reads it with a time limit, and kills it.
+``ReaderProcess`` starts the process, reads it with a time limit, and kills it.
 
-``CaptureClock`` says when a frame was taken: by its sender's reports, or by its arrival less the
+``CaptureClock`` finds when a frame was taken: by its sender's reports, or by its arrival less the
 jitter. RTCP sender reports (RFC 3550, 6.4.1) say which wall-clock time belongs to which time stamp,
 so a frame's capture is known as well as both machines' clocks agree. Without them it was taken at
 the latest when it arrived: its time is its stamp plus the least (arrival - stamp) of the last
 frames, which takes the jitter out but leaves the camera's own, constant delay in. That is stated as
-``arrival``, never mixed up with the other.
+``arrival``.
 
-Times handed out increase; a frame whose time does not is left out. Where that goes on for longer
-than ``PATIENCE_NS`` it begins anew from the arrival: this machine's clock was set back, or the
-sender's is not to be believed, as where it is further than ``MAX_APART_NS`` from the arrival.
+Times of capture increase; a frame whose time does not is left out. When that lasts longer than
+``PATIENCE_NS``, times begin anew from the arrival: this machine's clock was set back, or the
+sender's is wrong, as it also is when it is further than ``MAX_APART_NS`` from the arrival.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ WINDOW_FRAMES = 300
 
 @dataclass(frozen=True)
 class Stamp:
-    """When a frame was taken, Unix time, and on whose word."""
+    """The time at which a frame was taken, Unix time, and the clock that gave it."""
 
     time_ns: int
     clock: ClockKind
 
 
 class CaptureClock:
-    """Stamps the frames of one connection; all later than ``after_ns``."""
+    """Finds the times of the frames of one connection; all are later than ``after_ns``."""
 
     def __init__(self, after_ns: int = 0) -> None:
         self.last_ns = after_ns
@@ -117,7 +117,7 @@ class CaptureClock:
 
 
 BODY_TIMEOUT_S = 5.0
-"""For the rest of a record that has begun: the pipe's other end has it in memory."""
+"""Longest time for the rest of a record that has begun: the other end has it in memory."""
 
 
 class ReaderProcess:
@@ -146,7 +146,7 @@ class ReaderProcess:
         return EndRecord("the camera's reader died") if body is None else record_of(header, body)
 
     def close(self) -> None:
-        """Kill it and wait for its end."""
+        """Kill the process and wait for its end."""
         self._process.kill()
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
@@ -172,13 +172,13 @@ class ReaderProcess:
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 OPENING_S = 10.0
-"""For the first frame after opening: a process starts, a camera is asked, a key frame comes."""
+"""Longest time from opening to the first frame: a process starts, a key frame arrives."""
 POLL_S = 0.25
-"""A thread that is told to stop notices within this time."""
+"""A thread that is to stop notices it within this time."""
 
 
 class SourceProblem(StrEnum):
-    """Why a source was lost: a closed set, fit for a metric's label."""
+    """The reason why a source was lost: a closed set, fit for a metric's label."""
 
     ENDED = "ended"
     """The connection was closed, refused or broken, or what came could not be decoded."""
@@ -205,17 +205,17 @@ class LiveFrame:
 
 
 class Reader(Protocol):
-    """What reads a source (``cav_agent.live.source``)."""
+    """Reads a source, as ``ReaderProcess`` does."""
 
     def read(self, timeout_s: float) -> Record | None:
         """Return the next record, or None if none came in time; raise ``RfedgeError``."""
 
     def close(self) -> None:
-        """End it for good, whatever it hangs in."""
+        """End the reader, even if it hangs."""
 
 
 class SourceObserver(Protocol):
-    """Hears what happens to the sources of cameras, on the sources' threads."""
+    """Is called with the events of cameras' sources, on the sources' threads."""
 
     def source_open(self, camera_id: str, clock: ClockKind) -> None:
         """Frames come, and their times rest on ``clock``; called again when that changes."""
@@ -224,12 +224,12 @@ class SourceObserver(Protocol):
         """The source was lost, or could not be opened; ``begins``: it was not lost before."""
 
     def source_frames(self, taken: int, dropped: int) -> None:
-        """So many more frames were taken over, or dropped before they were coded."""
+        """Count frames that were taken over, or dropped before they were coded."""
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """Seconds that only go on, nanoseconds of Unix time, and a way to wait."""
+    """A monotonic clock, Unix time in nanoseconds, and a way to wait."""
 
     monotonic_s: Callable[[], float] = time.monotonic
     unix_ns: Callable[[], int] = time.time_ns
@@ -239,7 +239,7 @@ class Clocks:
 class LiveSource:
     """Opens a source by ``open_reader`` and keeps its newest frame.
 
-    ``step`` is for one thread, ``take`` and ``newest`` for any. ``repeats``: a file begins again.
+    One thread calls ``step``, any thread ``take`` and ``newest``. ``repeats``: a file begins again.
     """
 
     def __init__(

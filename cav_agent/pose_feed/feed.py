@@ -24,19 +24,19 @@ NS = 1_000_000_000
 MAX_LINE_BYTES = 4096
 """NMEA allows 82, gpsd's reports take up to 1.5 KB."""
 KEPT_FIXES = 2000
-"""Of a live feed: more than a minute at any rate of a receiver."""
+"""Fixes that are kept of a live feed: more than a minute at any rate of a receiver."""
 MOST_RECORDED = 2_000_000
 CLOCK_NS = 2 * NS
-"""A feed's clock further from ours than this is another clock: its times are shifted."""
+"""A feed's clock that differs by more from ours is another clock: its times are shifted."""
 CLOCK_WINDOW = 20
-"""Fixes whose least delay is the difference of the clocks."""
+"""The least delay of this many fixes is the difference of the clocks."""
 ZONE_NS = 15 * 60 * NS
-"""Zones of the Earth differ by multiples of a quarter of an hour."""
+"""Time zones differ by multiples of a quarter of an hour."""
 FASTEST_MPS = 80.0
-"""Faster than any vehicle this is for: 288 km/h."""
+"""More than any vehicle drives: 288 km/h."""
 SIGMAS = 4.0
 RESTARTED_AFTER = 3
-"""So many fixes in order among themselves, but before the last used: the feed began again."""
+"""This many fixes in order, but before the last used one, mean that the feed began again."""
 SILENT_PERIODS = 3.0
 LEAST_SILENT_NS = 2 * NS
 QUIET_S = 30.0
@@ -44,7 +44,7 @@ EARTH_M = 6_371_000.0
 
 
 class FeedReader:
-    """Takes bytes as they come; ``refused`` hears of each line that cannot be used."""
+    """Parses bytes as they come; ``refused`` is called for each line that cannot be used."""
 
     def __init__(self, refused: Callable[[BadReading], None]) -> None:
         self._refused = refused
@@ -101,10 +101,10 @@ def _too_long() -> BadReading:
 
 
 class ProblemLog:
-    """Passes problems on to ``tell``, with whether each begins: it is new, or was away for long."""
+    """Reports problems, and whether each begins: it is new, or was absent for ``QUIET_S``."""
 
-    def __init__(self, tell: Callable[[FeedProblem, str, bool], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[FeedProblem, str, bool], None]) -> None:
+        self._report = report
         self._last_ns: dict[FeedProblem, int] = {}
 
     def note(self, problem: FeedProblem, text: str, now_ns: int) -> None:
@@ -112,11 +112,11 @@ class ProblemLog:
         last_ns = self._last_ns.get(problem)
         self._last_ns[problem] = now_ns
         begins = last_ns is None or now_ns - last_ns > QUIET_S * NS
-        self._tell(problem, text, begins)
+        self._report(problem, text, begins)
 
 
 class FeedChecks:
-    """Decides about the fixes of one feed; ``recorded``: from a file, whose clock is its own."""
+    """Decides which fixes of one feed are used; ``recorded``: from a file, with its own clock."""
 
     def __init__(self, problems: ProblemLog, *, recorded: bool = False) -> None:
         self._problems = problems
@@ -128,7 +128,7 @@ class FeedChecks:
         self._period_ns = float(NS)
         self._is_silent = False
         self.shift_ns = 0
-        """To add to the feed's times to get the agent's."""
+        """Add to the feed's times to get the agent's."""
 
     def receive(self, fix: Fix, now_ns: int) -> bool:
         """Return whether a fix is to be used."""
@@ -144,7 +144,7 @@ class FeedChecks:
         return True
 
     def idle(self, now_ns: int) -> None:
-        """Notice silence; to be called now and then, at least once a second."""
+        """Detect silence; to be called at least once a second."""
         if self._used_at_ns is None:
             self._used_at_ns = now_ns
         silent_ns = now_ns - self._used_at_ns
@@ -179,7 +179,7 @@ class FeedChecks:
         far_m = distance_m(last, fix)
         spread_m = math.hypot(*fix.position_std_m[:2], *last.position_std_m[:2])
         if far_m > FASTEST_MPS * seconds + SIGMAS * spread_m:
-            text = f"{far_m:.1f} m in {seconds:.2f} s; the field will tell whether it is so"
+            text = f"{far_m:.1f} m in {seconds:.2f} s; the field shows whether it is true"
             self._problems.note(FeedProblem.JUMP, text, now_ns)
 
     def _compare_clocks(self, fix: Fix, now_ns: int) -> None:
@@ -226,19 +226,19 @@ class KeptFix:
 class PoseFeed:
     """The fixes of one source; written by one thread, read by others.
 
-    ``tell`` is called with each problem, its text, and whether it begins. ``recorded``: the whole
+    ``report`` is called with each problem, its text, and whether it begins. ``recorded``: the whole
     feed lies in a file, and its clock is that of the drive.
     """
 
     def __init__(
         self,
-        tell: Callable[[FeedProblem, str, bool], None],
+        report: Callable[[FeedProblem, str, bool], None],
         *,
         offset_s: float = 0.0,
         recorded: bool = False,
     ) -> None:
         self.recorded = recorded
-        self.problems = ProblemLog(tell)
+        self.problems = ProblemLog(report)
         self._offset_ns = round(offset_s * NS)
         self._checks = FeedChecks(self.problems, recorded=recorded)
         self._reader = FeedReader(self._refused)
@@ -254,11 +254,11 @@ class PoseFeed:
         return self._take(self._reader.receive(data, now_ns), now_ns)
 
     def end(self, now_ns: int) -> None:
-        """The source has ended: a last line may lack its end."""
+        """Take a last line without an end, when the source has ended."""
         self._take(self._reader.end(now_ns), now_ns)
 
     def idle(self, now_ns: int) -> None:
-        """Notice silence, unless the feed is a file."""
+        """Detect silence, unless the feed is a file."""
         if not self.recorded:
             self._checks.idle(now_ns)
 

@@ -48,7 +48,7 @@ FEWEST = 8
 DETERMINED_S = 0.1
 """A larger standard deviation says nothing."""
 LONGEST_GAP_S = 1.0
-"""Between poses of the field that a fix is compared with."""
+"""Longest time between poses of the field that a fix is compared with."""
 MARGIN_M = 50.0
 """A position is outside a field's bounds if it is this, and ``SIGMAS`` deviations, beyond them."""
 LONGEST_CARRY_S = 2.0

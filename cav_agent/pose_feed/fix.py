@@ -16,7 +16,7 @@ Rotation = tuple[float, float, float, float]
 
 
 class FeedProblem(StrEnum):
-    """What is wrong with a feed: a closed set, fit for a metric's label."""
+    """A problem of a feed: a closed set, fit for a metric's label."""
 
     MALFORMED = "malformed"
     """A line is none of the formats, or lacks what it must have."""
@@ -31,7 +31,7 @@ class FeedProblem(StrEnum):
     CLOCK = "clock"
     """The feed's clock is not the agent's; times are shifted by the difference."""
     JUMP = "jump"
-    """The position moved faster than a vehicle does. It is handed on: the field will tell."""
+    """The position moved faster than a vehicle does. It is used: the field shows if it is true."""
     OUTSIDE = "outside"
     """The position is outside the field's bounds."""
     NO_ANCHOR = "no_anchor"
@@ -52,13 +52,14 @@ class BadReading(InvalidData):
 
 @dataclass(frozen=True)
 class Fix:
-    """Where the vehicle was at ``time_ns`` of the feed's clock, nanoseconds of the Unix epoch.
+    """The vehicle's pose at ``time_ns`` of the feed's clock, nanoseconds of the Unix epoch.
 
     Either ``geodetic``, latitude and longitude in degrees and height in metres above the ellipsoid
     of WGS 84 (``None``: not measured), or ``xyz_m`` in the global metric frame of the drives.
     ``heading_deg``: of the vehicle's x axis, clockwise from north. ``rotation``: of the vehicle's
-    axes (x forward, y left, z up) to east, north, up, or to the global frame beside ``xyz_m``; it
-    goes before the heading. Standard deviations, one sigma: metres along the axes of the position.
+    axes (x forward, y left, z up) to east, north, up, or to the global frame with ``xyz_m``; it
+    takes precedence over the heading. Standard deviations: one sigma, in metres along the axes of
+    the position.
     """
 
     time_ns: int
@@ -71,7 +72,7 @@ class Fix:
 
 
 def finite(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return a number of a reading; raise ``BadReading`` for what is none or out of range."""
+    """Return a number of a reading; raise ``BadReading`` for anything else, or out of range."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str, Decimal)):
         raise BadReading(FeedProblem.MALFORMED, f"{name} is {value!r}, not a number")
     try:

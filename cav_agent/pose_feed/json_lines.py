@@ -1,7 +1,7 @@
-"""A line of JSON a pose: gpsd's reports, and a schema of our own for everything else.
+"""Parses a line of JSON per pose: gpsd's reports, or a schema of our own for everything else.
 
 gpsd (https://gpsd.gitlab.io/gpsd/gpsd_json.html): ``TPV`` gives the position, ``ATT`` the heading
-of a compass or of two antennas; other classes are passed over. Its error estimates count as 95 %.
+of a compass or of two antennas; other classes are ignored. Its error estimates count as 95 %.
 
 Our own schema, one object a line, keys with units; what is not named here is refused:
 
@@ -39,11 +39,11 @@ LEAST_SPEED_MPS = 1.5
 MOST_TIME_S = 18e9
 """Less than 2^64 nanoseconds."""
 FRESH_S = 1.0
-"""So long a heading of ATT goes with positions."""
+"""A heading of ATT goes with positions for this time."""
 
 
 class JsonParser:
-    """Takes one line after another."""
+    """Parses one line after another."""
 
     def __init__(self) -> None:
         self._attitude: tuple[int, float] | None = None

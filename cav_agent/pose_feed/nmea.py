@@ -1,10 +1,10 @@
-"""NMEA 0183 sentences of a GNSS receiver into fixes; ``pynmea2`` takes the sentences apart.
+"""Parses NMEA 0183 sentences of a GNSS receiver into fixes, by the library ``pynmea2``.
 
 A receiver sends several sentences an epoch. GGA gives position, height and quality; RMC the date,
 and the position where no GGA came until the second RMC; HDT the heading of two antennas; VTG and
 RMC the course over ground, which is the heading of a vehicle that drives; GST the standard
 deviations, of the epoch before where it follows GGA. One fix an epoch is made.
-A machine: lines go in, fixes come out; ``now_ns`` only tells the day before the first RMC.
+A state machine: lines go in, fixes come out; ``now_ns`` only gives the day before the first RMC.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ UNKNOWN_HEIGHT_STD_M = 50.0
 
 
 @dataclass(frozen=True)
-class _Course:
+class Course:
     """A heading, degrees clockwise from north, and the number of the sentence it came in."""
 
     heading_deg: float
@@ -41,7 +41,7 @@ class _Course:
 
 
 class NmeaParser:
-    """Takes one sentence after another; any talker (GP, GN, GL, ...)."""
+    """Parses one sentence after another, of any talker (GP, GN, GL, ...)."""
 
     def __init__(self) -> None:
         with needs("localise"):
@@ -51,7 +51,7 @@ class NmeaParser:
         self._epoch: time | None = None
         self._has_gga = False
         self._rmc_alone = 0
-        self._course: _Course | None = None
+        self._course: Course | None = None
         self._std_m: Vec3 | None = None
         self._sentences = 0
         self._takers: dict[str, Callable[[Any, int], Fix | None]] = {
@@ -112,7 +112,7 @@ class NmeaParser:
     def _hdt(self, message: Any, now_ns: int) -> None:  # noqa: ARG002
         if _is_given(message.heading):
             heading_deg = finite("HDT heading", message.heading, 0, 360)
-            self._course = _Course(heading_deg, HDT_STD_DEG, self._sentences)
+            self._course = Course(heading_deg, HDT_STD_DEG, self._sentences)
 
     def _gst(self, message: Any, now_ns: int) -> None:  # noqa: ARG002
         names = ("std_dev_longitude", "std_dev_latitude", "std_dev_altitude")
@@ -122,15 +122,15 @@ class NmeaParser:
             self._std_m = (east, north, up)
 
     def _take_course(self, course_deg: Any, speed_mps: float) -> None:
-        """Keep a course as the heading, unless it stands still or two antennas know better."""
+        """Keep a course as the heading, unless the vehicle stands or two antennas know better."""
         heading_deg = finite("course", course_deg, 0, 360)
         known = self._course
         has_hdt = known is not None and known.std_deg < COURSE_STD_DEG and self._is_recent(known)
         if speed_mps >= LEAST_SPEED_MPS and not has_hdt:
-            self._course = _Course(heading_deg, COURSE_STD_DEG, self._sentences)
+            self._course = Course(heading_deg, COURSE_STD_DEG, self._sentences)
 
-    def _is_recent(self, course: _Course) -> bool:
-        """Whether a heading came within the last two epochs, of a dozen sentences each."""
+    def _is_recent(self, course: Course) -> bool:
+        """Return whether a heading came within the last two epochs, of a dozen sentences each."""
         return self._sentences - course.sentence <= 24
 
     def _fix(self, message: Any, height_m: float | None, std_m: Vec3, now_ns: int) -> Fix | None:
@@ -170,7 +170,7 @@ def _unix_ns(day: date, at: time) -> int:
 
 
 def _nearest_ns(at: time, near_ns: int) -> int:
-    """Return the instant of a time of the day nearest to another instant."""
+    """Return the instant with this time of day that is nearest to another instant."""
     today = datetime.fromtimestamp(near_ns // 1_000_000_000, UTC).date()
     days = (today + timedelta(days=n) for n in (-1, 0, 1))
     return min((_unix_ns(day, at) for day in days), key=lambda ns: abs(ns - near_ns))

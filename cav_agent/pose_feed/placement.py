@@ -25,7 +25,7 @@ LOOKING_FORWARD = Pose.from_matrix([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]])
 
 @dataclass(frozen=True)
 class CameraMount:
-    """Where the camera is on the vehicle, seen from where the feed's position is."""
+    """The camera's place on the vehicle, seen from the point that the feed's position is of."""
 
     at_m: Vec3 = (0.0, 0.0, 0.0)
     """Lever arm: forward, left, up, m."""
@@ -49,7 +49,7 @@ class CameraMount:
 
 @dataclass(frozen=True)
 class FieldPlacement:
-    """Where a field lies: its anchor on the Earth, and its origin in the drives' global frame."""
+    """A field's anchor on the Earth, and its origin in the drives' global frame."""
 
     anchor: Anchor | None
     origin: TileOrigin

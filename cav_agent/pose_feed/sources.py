@@ -1,4 +1,4 @@
-"""Where a pose feed is read from: its options, and the task that reads it.
+"""The options of a pose feed, and the task that reads its source.
 
 A feed comes from a file, UDP, a serial line or gpsd. One task reads it, off the path of the frames,
 and gives bytes to a ``PoseFeed``. A source that cannot be opened or breaks off is reported and
@@ -36,7 +36,7 @@ MOST_WAITING = 1000
 
 
 class FeedKind(StrEnum):
-    """Where the lines of a feed come from."""
+    """The kind of a feed's source."""
 
     FILE = "file"
     UDP = "udp"
@@ -57,7 +57,7 @@ class FeedSource:
 
 @dataclass(frozen=True)
 class PoseFeedSettings:
-    """Where the vehicle's own poses come from, instead of the drive's."""
+    """The source of the vehicle's own poses, instead of the drive's."""
 
     pose_feed: str | None = None
     """GNSS as NMEA, gpsd's JSON, or JSON lines (docs/how-to/localise.md), from file:PATH,
@@ -65,7 +65,7 @@ class PoseFeedSettings:
     camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The camera seen from the feed's antenna: metres forward, left, up."""
     camera_turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """How it is turned from looking forward: degrees of yaw left, pitch down, roll right."""
+    """Its rotation from looking forward: degrees of yaw left, pitch down, roll right."""
     feed_offset_s: float = 0.0
     """Add to the feed's times to get the camera's, seconds."""
 
@@ -76,17 +76,17 @@ class PoseFeedSettings:
 
     @property
     def mount(self) -> CameraMount:
-        """Where the camera is on the vehicle."""
+        """Return where the camera is on the vehicle."""
         return CameraMount(self.camera_at, self.camera_turn)
 
     @property
     def source(self) -> FeedSource | None:
-        """The source, None where no feed is asked for."""
+        """The source; None where no feed is configured."""
         return None if self.pose_feed is None else parse_source(self.pose_feed)
 
 
 def parse_source(text: str) -> FeedSource:
-    """Return the source of ``file:PATH`` and the like; raise ``InvalidInput`` for others."""
+    """Parse ``file:PATH`` and the like; raise ``InvalidInput`` for others."""
     kind, _, rest = text.partition(":")
     if kind == FeedKind.FILE and rest:
         return FeedSource(FeedKind.FILE, Path(rest))

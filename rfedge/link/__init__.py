@@ -1,1 +1,1 @@
-"""The throughput-limited link as a TCP proxy between a real vehicle and a real server."""
+"""A throughput-limited link between a real vehicle and a real server, as a TCP proxy."""

@@ -1,6 +1,6 @@
-"""One direction of the link on real time: a ``rfcore.link`` machine with a pump.
+"""One direction of the link in real time: an ``rfcore.link`` state machine, driven by a task.
 
-Packets are callbacks: what is pushed is called when it is due. Used by ``rfedge.link.proxy``.
+Packets are callbacks: what is pushed is called when it is due.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from rfcore.link.shaper import BusyMeter
 __all__ = ["SPIN_S", "Direction", "Sender"]
 
 SPIN_S = 0.0002
-"""How long before a release the pump stops sleeping and yields in a loop: the kernel's timer slack
-of 50 us and the loop's own time. Longer would make the scheduler see a busy process and interrupt
-it just when it matters. Many links in one process would spin all the time; they are given 0."""
+"""Time before a release at which the pump stops sleeping and yields in a loop: the kernel's timer
+slack of 50 us and the loop's own time. Longer would make the scheduler see a busy process and
+interrupt it just when it matters. Many links in one process would spin all the time, so they use
+0."""
 
 
 class Sender(Protocol):
-    """Who pushes into a direction, and can be told to wait."""
+    """Pushes into a direction, and can be made to wait."""
 
     def hold(self, reason: str) -> None:
         """Push nothing until ``resume`` with the same reason."""
@@ -37,14 +38,14 @@ class Sender(Protocol):
 
 @dataclass(frozen=True)
 class Packet:
-    """What is in the link: what to do at the end, and since when."""
+    """A callback for the end of the link, and the time at which it was pushed."""
 
     release: Callable[[], None]
     pushed_s: float
 
 
 def _ignore(transit_s: float) -> None:
-    """Nobody wants to know."""
+    """Do nothing."""
 
 
 class Direction:
@@ -67,16 +68,16 @@ class Direction:
 
     @property
     def room_bytes(self) -> int:
-        """How much may still be pushed."""
+        """Return the bytes that may still be pushed."""
         return self._link.room_bytes(time.perf_counter())
 
     @property
     def held_bytes(self) -> int:
-        """How much is in the link."""
+        """Return the bytes in the link."""
         return self._link.held_bytes
 
     def push(self, release: Callable[[], None], size_bytes: int) -> None:
-        """Let ``release`` be called when ``size_bytes`` have been through the link."""
+        """Call ``release`` when ``size_bytes`` have passed the link."""
         now = time.perf_counter()
         self._link.push(Packet(release, now), size_bytes, now)
         self._arrived.set()
@@ -101,7 +102,7 @@ class Direction:
                     sender.resume("link")
 
     def _next_event_at(self) -> float | None:
-        """When a packet is due, or senders that are held may go on."""
+        """Return when a packet is due, or senders that are held may go on."""
         events = [self._link.next_event_at(), self._link.room_at() if self._holding else None]
         return min((event for event in events if event is not None), default=None)
 

@@ -1,4 +1,4 @@
-"""What Prometheus sees of ``rfedge link``. All names begin with ``rfedge_link_``."""
+"""The Prometheus metrics of ``rfedge link``. All names begin with ``rfedge_link_``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["LinkMetrics"]
 
 
 class LinkMetrics:
-    """Metrics of both directions; what the directions count anyway is read when it is asked for."""
+    """Metrics of both directions; what the directions count themselves is read at each scrape."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self.instruments = make = Instruments(registry)
@@ -32,7 +32,7 @@ class LinkMetrics:
             make.collector(family, _Reading(family, read, self._directions))
 
     def transit(self, direction: str) -> Callable[[float], None]:
-        """Return what is told how long each segment was in the link."""
+        """Return the function to call with the time of each segment in the link."""
         return self._transit.labels(direction).observe
 
     def observe(self, directions: Mapping[str, Direction]) -> None:

@@ -2,12 +2,13 @@
 
 An asyncio TCP proxy around two ``rfcore.link`` machines, one a direction, shared by all
 connections as one radio link would be. Sizes are wire bytes (HTTP/2 and all). Nothing is lost or
-reordered; when a direction holds as much as it may, its senders are not read, and TCP tells them.
+reordered; when a direction holds as much as it may, its senders are not read, so TCP slows them.
 
 A release that is late makes the link look slower than it is. So the command sleeps with select(),
-which is exact to the microsecond where epoll rounds up to milliseconds, and asks for a real-time
-priority; the report says whether it got one and how late the latest release was. Beside two busy
-processes on two cores the latest of 24 frames was 0.2 ms late with the priority and 13 ms without.
+which is exact to the microsecond where epoll rounds up to milliseconds, and requests a real-time
+priority; the report says whether it was granted and how late the latest release was. Beside two
+busy processes on two cores the latest of 24 frames was 0.2 ms late with the priority and 13 ms
+without.
 
 ``Side`` is one end of one connection through the link, as an asyncio protocol.
 """
@@ -90,11 +91,11 @@ class Side(asyncio.BufferedProtocol):
 
     @property
     def is_open(self) -> bool:
-        """Whether the socket is connected and nobody closes it."""
+        """Return whether the socket is connected and not being closed."""
         return self.transport is not None and not self.transport.is_closing()
 
     def bound_receive_buffer(self) -> None:
-        """Keep the kernel from hiding seconds of data behind the link's own queue."""
+        """Limit the kernel's buffer, which would hide seconds of data behind the link's queue."""
         if self.transport is not None:
             sock = self.transport.get_extra_info("socket")
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BUFFER_BYTES)
@@ -122,12 +123,12 @@ class Side(asyncio.BufferedProtocol):
         self._ended()
 
     def pause_writing(self) -> None:
-        """Our socket does not take more: the other end shall not send more."""
+        """Stop the other end, since our socket takes no more."""
         if self.peer is not None:
             self.peer.hold("receiver")
 
     def resume_writing(self) -> None:
-        """Our socket takes data again."""
+        """Let the other end go on, since our socket takes data again."""
         if self.peer is not None:
             self.peer.resume("receiver")
 
@@ -154,7 +155,7 @@ SCHEDULERS = {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}
 
 @dataclass(frozen=True)
 class ProxySettings:
-    """Where the link begins (``listen``) and ends (``to``), HOST:PORT, and what it is like.
+    """The ends of the link (``listen`` and ``to``), HOST:PORT, and its properties.
 
     ``also`` has further paths over the same link, LISTEN=TO each. ``profile`` is a link profile in
     a file; without it a constant rate and ``delay_ms`` one way, in either direction. ``report``
@@ -229,7 +230,7 @@ class LinkProxy:
 
     @property
     def address(self) -> Address:
-        """Where the first path begins."""
+        """Return the address at which the first path begins."""
         return self.addresses[0]
 
     async def start(self) -> Address:
@@ -312,7 +313,7 @@ class LinkProxy:
             self._cut(near, far)
 
     def _cut(self, *sides: Side) -> None:
-        """Lose a connection, unless it is over by itself."""
+        """Break a connection, unless it has ended by itself."""
         if all(side.is_open for side in sides):
             self._connections_cut += 1
             self._metrics.cut.inc()
@@ -349,4 +350,4 @@ async def _run(settings: ProxySettings) -> None:
 
 
 def _ignore() -> None:
-    """The near side reports for both."""
+    """Do nothing: the near side reports for both."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cav_agent.lights import FITS_LEVELS, LOOK_EVERY, TileLights
+from cav_agent.lights import FITS_LEVELS, TRY_EVERY, TileLights
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.block_means import median_block_mean_difference
 from rfcore.field import FULL, FieldMetadata, Quality, SplatField
@@ -49,7 +49,7 @@ def test_while_the_field_fits_nothing_is_wanted() -> None:
     noon = flat(0.8)
     lights = TileLights(noon, lambda: wanted.append(1))
     lights.add(flat(0.7))
-    for _ in range(3 * LOOK_EVERY):
+    for _ in range(3 * TRY_EVERY):
         lights.view(frame_of(noon), CAMERA, FULL)
     assert not wanted
     assert lights.current is noon
@@ -75,7 +75,7 @@ def test_between_two_lights_the_one_in_use_stays() -> None:
     lights.add(dusk)
     middle = round(float(np.median([frame_of(noon).y, frame_of(dusk).y])))
     for step in (-1, 1, -1, 1):
-        for _ in range(LOOK_EVERY):
+        for _ in range(TRY_EVERY):
             lights.view(grey(middle + step), CAMERA, FULL)
         assert lights.current is noon
 
@@ -85,7 +85,7 @@ def test_the_day_comes_back_to_the_tiles_own_field() -> None:
     lights = TileLights(noon)
     lights.add(dusk)
     for field in (dusk, noon):
-        for _ in range(LOOK_EVERY + 1):
+        for _ in range(TRY_EVERY + 1):
             lights.view(frame_of(field), CAMERA, FULL)
         assert lights.current is field
 
@@ -111,7 +111,7 @@ def test_the_own_field_takes_the_place_of_its_preview_with_the_next_frame() -> N
     assert view.render.digest() == frame_of(own).digest()
     assert lights.held_ids() == {own.field_id}
     lights.add(dusk)
-    for _ in range(LOOK_EVERY):
+    for _ in range(TRY_EVERY):
         lights.view(frame_of(dusk), CAMERA, FULL)
     assert lights.current is dusk
 
@@ -155,13 +155,13 @@ def test_a_part_is_no_light_for_frames_of_more_detail_than_it_has() -> None:
     own, dusk = flat(0.8), flat(0.4)
     lights = TileLights(beginning_of(own, 0.25))
     lights.add(dusk)
-    for _ in range(2 * LOOK_EVERY):
+    for _ in range(2 * TRY_EVERY):
         lights.view(frame_of(dusk), CAMERA, lights.drawable(FULL))
     assert lights.current is dusk
-    for _ in range(2 * LOOK_EVERY):
+    for _ in range(2 * TRY_EVERY):
         lights.view(frame_of(own), CAMERA, lights.drawable(FULL))
     assert lights.current is dusk, "the part cannot be drawn at full detail"
     lights.take_own(own)
-    for _ in range(2 * LOOK_EVERY):
+    for _ in range(2 * TRY_EVERY):
         lights.view(frame_of(own), CAMERA, lights.drawable(FULL))
     assert lights.current is own
