@@ -9,6 +9,16 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("rfedge", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("rfedge")
 
+SLOW_TEST_S = 120
+"""Time limit of a slow test that states none; pyproject.toml has that of the others."""
+
+
+@pytest.hookimpl(trylast=True)  # after hooks that mark tests as slow
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_TEST_S))
+
 
 def debian_program(name: str) -> str:
     """Return the path of a program, or fail: this machine could have it."""

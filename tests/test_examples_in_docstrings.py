@@ -19,6 +19,7 @@ ENTRY_POINTS = [
     "rfcore.link.shaper.Link",
     "rfcore.localise.localiser.Localiser",
     "rfcore.wire.drive_file.read_drive",
+    "cav_agent.vehicle.Vehicle",
     "rfcore.codec.sender.encoder.DeltaEncoder",
     "rfcore.field.interface.render_field_view",
     "rfcore.field.store.load_field",
