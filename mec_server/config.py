@@ -11,7 +11,7 @@ from tyro.conf import Suppress, arg
 
 from rfcore.errors import InvalidInput
 from rfcore.update.run import LearnAs
-from rfcore.wire.checks import MAX_RATE_HZ, check_name
+from rfcore.wire.checks import MAX_RATE_HZ, check_name, check_range
 from rfcore.wire.nats import NatsServers
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
 
@@ -58,8 +58,7 @@ class SessionLimits:
         for name in ("hello_s", "idle_s", "stalled_s"):
             if not getattr(self, name) > 0:
                 raise InvalidInput(f"limits.{name}", f"{getattr(self, name)} must be above 0 s")
-        if not 1 <= self.window_frames <= 64:
-            raise InvalidInput("limits.window_frames", f"{self.window_frames} is outside 1..64")
+        check_range("limits.window_frames", self.window_frames, 1, 64)
 
 
 @dataclass(frozen=True)
@@ -99,9 +98,9 @@ class IdentityBudget:
                 "identity-rejected-workers", f"{self.rejected_workers:g} is outside 0..256"
             )
         for name in ("streams", "decoders", "fetches", "watches", "rpcs"):
-            _check_budget(f"identity.{name}", getattr(self, name), 100_000)
+            check_range(f"identity.{name}", getattr(self, name), 1, 100_000)
         for name in ("calls_per_s", "messages_per_s", "bytes_per_s"):
-            _check_budget(f"identity.{name}", getattr(self, name), 1e12)
+            check_range(f"identity.{name}", getattr(self, name), 1, 1e12)
 
 
 @dataclass(frozen=True)
@@ -127,17 +126,11 @@ class ServerBudget:
 
     def __post_init__(self) -> None:
         for name in ("streams", "fetches", "rpcs"):
-            _check_budget(f"max-{name}", getattr(self, name), 100_000)
+            check_range(f"max-{name}", getattr(self, name), 1, 100_000)
         for name in ("decoders", "watches"):
-            if not 0 <= getattr(self, name) <= 100_000:
-                raise InvalidInput(f"max-{name}", f"{getattr(self, name)} is outside 0..100000")
+            check_range(f"max-{name}", getattr(self, name), 0, 100_000)
         for name in ("calls_per_s", "messages_per_s", "bytes_per_s"):
-            _check_budget(f"max-{name}", getattr(self, name), 1e12)
-
-
-def _check_budget(name: str, value: float, highest: float) -> None:
-    if not 1 <= value <= highest:
-        raise InvalidInput(name, f"{value:g} is outside 1..{highest:g}")
+            check_range(f"max-{name}", getattr(self, name), 1, 1e12)
 
 
 @dataclass(frozen=True)
@@ -155,8 +148,7 @@ class AdmissionLimits:
     retry_s: Annotated[float, Suppress] = 5.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.load <= 1:
-            raise InvalidInput("max-load", f"{self.load:g} is outside 0..1")
+        check_range("max-load", self.load, 0, 1)
         if not 0 < self.lowest_hz <= MAX_RATE_HZ:
             raise InvalidInput("lowest-rate", f"{self.lowest_hz:g} is outside 0..{MAX_RATE_HZ:g}")
         if not self.render_deadline_s > 0:
@@ -179,10 +171,8 @@ class RecordSettings:
     """Age at which a part is deleted, in hours."""
 
     def __post_init__(self) -> None:
-        if not 0.01 <= self.max_gb <= 1e6:
-            raise InvalidInput("record-max-gb", f"{self.max_gb:g} is outside 0.01..1e6")
-        if not 0.01 <= self.max_age_h <= 1e6:
-            raise InvalidInput("record-max-age-h", f"{self.max_age_h:g} is outside 0.01..1e6")
+        check_range("record-max-gb", self.max_gb, 0.01, 1e6)
+        check_range("record-max-age-h", self.max_age_h, 0.01, 1e6)
 
 
 @dataclass(frozen=True)
@@ -209,16 +199,11 @@ class LearnSettings:
     seconds."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.min_identities <= 1000:
-            raise InvalidInput("learn-min-identities", f"{self.min_identities} is outside 1..1000")
-        for name, value, low, high in (
-            ("cpu-s-per-h", self.cpu_s_per_h, 1.0, 3600.0),
-            ("max-gb", self.max_gb, 0.001, 1e6),
-            ("max-age-h", self.max_age_h, 0.01, 1e6),
-            ("quiet-s", self.quiet_s, 0.1, 3600.0),
-        ):
-            if not low <= value <= high:
-                raise InvalidInput(f"learn-{name}", f"{value:g} is outside {low:g}..{high:g}")
+        check_range("learn-min-identities", self.min_identities, 1, 1000)
+        check_range("learn-cpu-s-per-h", self.cpu_s_per_h, 1.0, 3600.0)
+        check_range("learn-max-gb", self.max_gb, 0.001, 1e6)
+        check_range("learn-max-age-h", self.max_age_h, 0.01, 1e6)
+        check_range("learn-quiet-s", self.quiet_s, 0.1, 3600.0)
 
 
 @dataclass(frozen=True)
@@ -320,12 +305,9 @@ class ServerConfig:
     limits: Annotated[SessionLimits, Suppress] = SessionLimits()
 
     def __post_init__(self) -> None:
-        if self.workers is not None and not 1 <= self.workers <= 256:
-            raise InvalidInput("workers", f"{self.workers} is outside 1..256")
-        for name in ("address", "identity"):
-            most = getattr(self, f"{name}_connections")
-            if not 0 <= most <= 65_536:
-                raise InvalidInput(f"{name}-connections", f"{most} is outside 0..65536")
+        check_range("workers", 1 if self.workers is None else self.workers, 1, 256)
+        check_range("address-connections", self.address_connections, 0, 65_536)
+        check_range("identity-connections", self.identity_connections, 0, 65_536)
         if not (self.max_connection_age_s == 0 or 1 <= self.max_connection_age_s <= 1e6):
             raise InvalidInput(
                 "max_connection_age_s", f"{self.max_connection_age_s:g} is neither 0 nor 1..1e6"
@@ -341,9 +323,6 @@ class ServerConfig:
         self.nats.servers(self.transport.allow_insecure)
         if not self.fields.is_dir():
             raise InvalidInput("fields", f"{self.fields} is not a directory")
-        if not 0 <= self.drain_hold_s <= MAX_DRAIN_HOLD_S:
-            raise InvalidInput(
-                "drain_hold_s", f"{self.drain_hold_s:g} is outside 0..{MAX_DRAIN_HOLD_S:g}"
-            )
+        check_range("drain_hold_s", self.drain_hold_s, 0, MAX_DRAIN_HOLD_S)
         if not self.drain_s >= 0:
             raise InvalidInput("drain_s", f"{self.drain_s} must not be negative")

@@ -31,7 +31,7 @@ from rfcore.wire.instruments import DurationSeries, Family, Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
 from rfcore.wire.tiles import Tile
 
-__all__ = ["BackgroundTask", "OpeningResult", "ServerMetrics", "VehicleMetrics"]
+__all__ = ["BackgroundTask", "OpeningResult", "ReadCounter", "ServerMetrics", "VehicleMetrics"]
 
 log = structlog.get_logger()
 
@@ -188,9 +188,9 @@ class ServerMetrics:
             "rfedge_server_identity_budget", "What one identity may hold.", ("resource",)
         )
         self._spent: dict[str, Callable[[], float]] = {}
-        make.collector(SPENT_FAMILY, _Counts(SPENT_FAMILY, self._spent))
+        make.collector(SPENT_FAMILY, ReadCounter(SPENT_FAMILY, self._spent))
         self._suppressed: dict[str, Callable[[], float]] = {}
-        make.collector(SUPPRESSED, _Counts(SUPPRESSED, self._suppressed))
+        make.collector(SUPPRESSED, ReadCounter(SUPPRESSED, self._suppressed))
         self.decoders_lost = make.counter(
             "rfedge_server_decoders_lost",
             "Decoder processes that died in use: by a signal, by themselves, or for being slow.",
@@ -247,7 +247,7 @@ class ServerMetrics:
             ("tile",),
         )
         self._withdrawals: dict[str, Callable[[], float]] = {}
-        make.collector(WITHDRAWALS, _Counts(WITHDRAWALS, self._withdrawals))
+        make.collector(WITHDRAWALS, ReadCounter(WITHDRAWALS, self._withdrawals))
         self._fields = make.gauge(
             "rfedge_server_field_info",
             "1 for each open radiance field: the first 16 digits of its id, and its kind.",
@@ -434,7 +434,7 @@ class VehicleMetrics:
         return counter
 
 
-class _Counts(Collector):
+class ReadCounter(Collector):
     """Counters that are read from elsewhere at each scrape, by the value of their one label."""
 
     def __init__(self, family: Family, counts: Mapping[str, Callable[[], float]]) -> None:

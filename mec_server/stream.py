@@ -138,27 +138,15 @@ class Stream:
         return self._session.session_id
 
     @property
-    def vehicle_id(self) -> str:
-        """The vehicle of the stream; empty before its Hello was accepted."""
-        hello = self._session.hello
-        return "" if hello is None else hello.vehicle_id
+    def hello(self) -> Hello:
+        """The vehicle's Hello, once it was accepted."""
+        assert self._session.hello is not None
+        return self._session.hello
 
     @property
     def takes_notices(self) -> bool:
         """Whether the vehicle wants notices."""
         return self._session.takes_notices
-
-    @property
-    def camera_ids(self) -> tuple[str, ...]:
-        """The cameras of its Hello, in their order."""
-        hello = self._session.hello
-        return () if hello is None else tuple(camera.camera_id for camera in hello.cameras)
-
-    @property
-    def field_ids(self) -> frozenset[str]:
-        """The fields that its vehicle codes against."""
-        hello = self._session.hello
-        return frozenset() if hello is None else frozenset(hello.field_ids)
 
     def tell(self, notice: StreetNotice) -> None:
         """Send a notice to the vehicle."""
@@ -190,8 +178,8 @@ class Stream:
         self._timer.cancel()
         self._decoders.close()
         self._server.twin.leave(self._session.session_id)
-        if self._server.trials is not None:
-            self._server.trials.left(self.vehicle_id)
+        if self._server.trials is not None and self._session.hello is not None:
+            self._server.trials.left(self.hello.vehicle_id)
         self._metrics.forget()
         self._account.ended(time.monotonic())
         self._account.leave()

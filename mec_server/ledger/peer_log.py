@@ -70,22 +70,17 @@ class PeerLog:
 
     def info(self, event: str, **values: Any) -> None:
         """Write a line about something usual."""
-        suppressed = self._limiter.admit(self._identity, self._clock_s())
-        if suppressed is not None:
-            self._logger.info(event, **values, **_missing(suppressed))
+        self._write(self._logger.info, event, values)
 
     def warning(self, event: str, **values: Any) -> None:
         """Write a line about something that was refused."""
-        suppressed = self._limiter.admit(self._identity, self._clock_s())
-        if suppressed is not None:
-            self._logger.warning(event, **values, **_missing(suppressed))
+        self._write(self._logger.warning, event, values)
 
     def error(self, event: str, **values: Any) -> None:
         """Write a line about something that failed here."""
+        self._write(self._logger.error, event, values)
+
+    def _write(self, write: Callable[..., Any], event: str, values: dict[str, Any]) -> None:
         suppressed = self._limiter.admit(self._identity, self._clock_s())
         if suppressed is not None:
-            self._logger.error(event, **values, **_missing(suppressed))
-
-
-def _missing(suppressed: int) -> dict[str, int]:
-    return {"suppressed": suppressed} if suppressed else {}
+            write(event, **values, **({"suppressed": suppressed} if suppressed else {}))

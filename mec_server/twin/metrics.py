@@ -6,9 +6,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from mec_server.metrics import ReadCounter
 from mec_server.twin.state import Twin
 from rfcore.wire.instruments import Family, Instruments
 from rfcore.wire.notices import NOTICE_KINDS, ObjectAhead, StreetNotice
@@ -58,7 +59,7 @@ class TwinMetrics:
         labels = ("vehicle",) if per_vehicle else ()
         age = Family(AGE.name, AGE.kind, AGE.text, labels)
         make.collector(age, _Ages(age, lambda: twin.ages_s(time.monotonic())))
-        make.collector(MISSED, _Counted(MISSED, lambda: twin.missed))
+        make.collector(MISSED, ReadCounter(MISSED, {"": lambda: twin.missed}))
         self.consumers = make.gauge("rfedge_twin_consumers", "Consumers that watch the twin.")
         self.ended = make.counter(
             "rfedge_twin_consumers_ended",
@@ -90,7 +91,7 @@ class TwinMetrics:
         )
         self.nats_missed: Callable[[], int] = int
         """Returns the number of pictures that were not published so far; read at each scrape."""
-        make.collector(NATS_DROPPED, _Counted(NATS_DROPPED, lambda: self.nats_missed()))
+        make.collector(NATS_DROPPED, ReadCounter(NATS_DROPPED, {"": lambda: self.nats_missed()}))
         for kind in NOTICE_KINDS:
             self.notices.labels(kind)
         for reason in ConsumerEnd:
@@ -127,15 +128,3 @@ class _Ages(Collector):
         return GaugeMetricFamily(
             self._family.name, self._family.text, labels=list(self._family.labels)
         )
-
-
-class _Counted(Collector):
-    def __init__(self, family: Family, counted: Callable[[], int]) -> None:
-        self._family = family
-        self._counted = counted
-
-    def describe(self) -> Iterable[Metric]:
-        return [CounterMetricFamily(self._family.name, self._family.text)]
-
-    def collect(self) -> Iterable[Metric]:
-        return [CounterMetricFamily(self._family.name, self._family.text, self._counted())]

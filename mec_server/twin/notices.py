@@ -38,6 +38,7 @@ from mec_server.twin.state import ReceivedPicture, Twin
 from rfcore.camera import Camera, Pose
 from rfcore.errors import LimitExceeded
 from rfcore.perception.objects import FollowedObject, ObjectTracker
+from rfcore.wire.messages import Hello
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
 from rfcore.wire.tiles import Tile
 from rfcore.wire.twin import PictureEncoding, Subscription
@@ -86,16 +87,8 @@ class NoticeTaker(Protocol):
         """The id of the stream."""
 
     @property
-    def vehicle_id(self) -> str:
-        """The vehicle of the stream."""
-
-    @property
-    def camera_ids(self) -> tuple[str, ...]:
-        """The cameras of its Hello, in their order."""
-
-    @property
-    def field_ids(self) -> frozenset[str]:
-        """The fields that its vehicle codes against."""
+    def hello(self) -> Hello:
+        """The Hello of its vehicle."""
 
     def tell(self, notice: StreetNotice) -> None:
         """Send a notice."""
@@ -322,7 +315,7 @@ class StreetNotices:
         mailbox = self._twin.watch(every, arrived.set, counts_misses=False)
         self._twin.expect = self._expect
         for taker in self._takers():
-            for field_id in taker.field_ids:
+            for field_id in taker.hello.field_ids:
                 self._views.prepare(self._tile_of(field_id), NOTICES_IDENTITY)
         try:
             while self._takers():
@@ -351,13 +344,15 @@ class StreetNotices:
         """Notify the vehicles of a tile of its new field."""
         for tile, change in field_changes(before, after):
             for taker in self._takers():
-                if taker.field_ids & tile.archive_ids:
+                if tile.archive_ids.intersection(taker.hello.field_ids):
                     self._tell(taker, self._stream(taker).about_field(change))
 
     async def _look_at(self, picture: ReceivedPicture) -> None:
         """Find the objects in a picture, and send notices to the vehicles that they concern."""
         tile = self._tile_of(picture.field_id)
-        takers = [taker for taker in self._takers() if taker.field_ids & tile.field_ids]
+        takers = [
+            taker for taker in self._takers() if tile.field_ids.intersection(taker.hello.field_ids)
+        ]
         if not takers:
             self._trackers.pop(tile.field_ids, None)
             return
@@ -390,7 +385,8 @@ class StreetNotices:
         ]
         if not cameras:
             return
-        stream, own = self._stream(taker), VehiclePosition.of(cameras, taker.camera_ids)
+        camera_ids = [camera.camera_id for camera in taker.hello.cameras]
+        stream, own = self._stream(taker), VehiclePosition.of(cameras, camera_ids)
         for notice in stream.about_objects(tile.field_id, own, objects, now):
             self._tell(taker, notice)
 
@@ -399,7 +395,7 @@ class StreetNotices:
         self._metrics.noticed(notice)
 
     def _stream(self, taker: NoticeTaker) -> StreamNotices:
-        return self._streams.setdefault(taker.session_id, StreamNotices(taker.vehicle_id))
+        return self._streams.setdefault(taker.session_id, StreamNotices(taker.hello.vehicle_id))
 
     def _forget_streams(self) -> None:
         open_now = {taker.session_id for taker in self._takers()}

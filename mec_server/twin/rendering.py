@@ -16,6 +16,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from threading import Lock
@@ -224,7 +225,7 @@ class ViewService:
         self._composing = _FieldThread(views, open_fields())
         self._finding = _FieldThread(objects, open_fields())
         self._analyses = _AnalysisCache()
-        self._ahead = 0
+        self._ahead: set[asyncio.Task[None]] = set()
 
     def close(self) -> None:
         """Stop the threads."""
@@ -287,23 +288,16 @@ class ViewService:
         """
         self._prepare_for(partial(self._ground_ahead, camera, tile), identity)
 
-    def _prepare_for(self, draw: Callable[[], object], identity: str) -> None:
+    def _prepare_for(self, draw: Callable[[], None], identity: str) -> None:
         """Draw, unless ``MOST_AHEAD`` tasks wait or ``identity`` has spent its worker time."""
-        if self._ahead >= MOST_AHEAD:
-            return
-        try:
-            self._ledger.check(identity, Resource.WORKER_SECONDS, time.monotonic())
-        except LimitExceeded:
-            return
-        self._ahead += 1
-        work = partial(_seconds_of, draw)
-        self._finding.worker.submit(identity, work, partial(self._prepared, identity))
+        if len(self._ahead) < MOST_AHEAD:
+            task = asyncio.create_task(self._prepared(draw, identity))
+            self._ahead.add(task)
+            task.add_done_callback(self._ahead.discard)
 
-    def _prepared(self, identity: str, outcome: float | Exception) -> None:
-        self._ahead -= 1
-        if isinstance(outcome, Exception):
-            raise outcome
-        self._ledger.charge(identity, Resource.WORKER_SECONDS, outcome, time.monotonic())
+    async def _prepared(self, draw: Callable[[], None], identity: str) -> None:
+        with suppress(LimitExceeded):
+            await self._on_thread(self._finding, identity, draw)
 
     def tile(
         self, request: ViewRequest | ObjectsRequest, may_draw: Callable[[str], bool]
@@ -433,12 +427,6 @@ class ViewService:
         render = self._twin.renders.of(picture)
         same = picture.field_id == field.field_id and camera.intrinsics == picture.intrinsics
         return field.render(camera, FULL) if render is None or not same else render
-
-
-def _seconds_of(work: Callable[[], object]) -> float:
-    started = time.monotonic()
-    work()
-    return time.monotonic() - started
 
 
 def _labels(classify: Classify, analysed: _AnalysedPicture) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from rfcore.errors import InvalidInput
     ("change", "named"),
     [
         ({"workers": 0}, "workers: 0 is outside 1..256"),
-        ({"drain_hold_s": 601.0}, "drain_hold_s: 601 is outside 0..600"),
+        ({"drain_hold_s": 601.0}, "drain_hold_s: 601.0 is outside 0..600"),
         ({"drain_s": -1.0}, "drain_s: -1.0 must not be negative"),
         ({"fields": Path("/nonexistent")}, "fields: /nonexistent is not a directory"),
     ],

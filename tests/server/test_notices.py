@@ -97,9 +97,8 @@ async def test_an_object_is_told_of_with_a_picture_that_shows_it(
     monkeypatch.setattr(notices.time, "monotonic", lambda: NOW)
     twin = Mock(cameras_of=lambda _: [[view(None), view(HERE)], [view(None, camera_id="rear")]])
     views = Mock(objects_in=AsyncMock(return_value=PictureObjects([])))
-    taker = Mock(
-        session_id="s", vehicle_id="me", camera_ids=("front",), field_ids=frozenset((FIELD,))
-    )
+    hello = Mock(vehicle_id="me", cameras=[Mock(camera_id="front")], field_ids=(FIELD,))
+    taker = Mock(session_id="s", hello=hello)
     street = StreetNotices(twin, views, lambda: [taker], lambda: (), Mock())
     await street._look_at(picture)
     (notice,) = (call.args[0] for call in taker.tell.call_args_list)
