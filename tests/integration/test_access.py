@@ -1,7 +1,6 @@
 """Certificates on a live server: revoked, expired, granted less; connections of a great age."""
 
 import asyncio
-from collections.abc import Callable
 from contextlib import AsyncExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,14 +11,13 @@ import pytest
 from structlog.testing import capture_logs
 
 import mec_server.server
+from live_server import Files, certificates, channel_to, open_stream, watch_call
 from mec_server.config import IdentityBudget
 from rfcore.camera import Camera
-from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
+from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.convert_answers import server_messages_from_bytes
-from rfcore.wire.messages import Welcome
 from rfcore.wire.tls import TlsFiles
-from rfcore.wire.twin import Subscription, subscription_to_wire, twin_message_from_wire
+from rfcore.wire.twin import Subscription, twin_message_from_wire
 from rfcore.wire.twin_render import (
     ObjectsRequest,
     ViewRequest,
@@ -27,22 +25,15 @@ from rfcore.wire.twin_render import (
     view_request_to_wire,
 )
 from rfcore.wire.v1 import field_pb2, field_pb2_grpc, twin_pb2_grpc
-from rfedge.certs import Members, certify, write_certificates
+from rfedge.certs import Members
 
-Files = Callable[[str], TlsFiles]
 SUPPRESSED = "rfedge_server_log_lines_suppressed_total"
 MEMBERS = Members(("cav-raw", "cav-1", "cav-2"), ("desk", "other"), operators=("op",))
 
 
 @pytest.fixture
 def certs(tmp_path: Path) -> Files:
-    write_certificates(tmp_path / "certs", certify(MEMBERS, datetime.now(UTC), days=30))
-
-    def files(name: str) -> TlsFiles:
-        root = tmp_path / "certs"
-        return TlsFiles(root / f"{name}.pem", root / f"{name}.key", root / "ca.pem")
-
-    return files
+    return certificates(tmp_path / "certs", MEMBERS)
 
 
 @pytest.fixture
@@ -50,24 +41,12 @@ def swift(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mec_server.server, "SWEEP_EVERY_S", 0.02)
 
 
-def channel_to(address: object, tls: TlsFiles) -> grpc.aio.Channel:
-    return grpc.aio.secure_channel(str(address), tls.channel_credentials(), CHANNEL_OPTIONS)
-
-
 async def status_of_watch(address: object, tls: TlsFiles, *names: str) -> grpc.StatusCode:
     """Watch until the server ends the stream; return how."""
     async with channel_to(address, tls) as channel:
         subscription = Subscription(frozenset(names))
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(subscription))
+        call = watch_call(channel, subscription)
         return await call.code()
-
-
-async def open_stream(channel: grpc.aio.Channel, hello: Any) -> Any:
-    stream = channel.stream_stream(STREAM_METHOD)()
-    await stream.write(client_message_to_bytes(hello))
-    (welcome, *_) = server_messages_from_bytes(await stream.read())
-    assert isinstance(welcome, Welcome)
-    return stream
 
 
 @pytest.mark.usefixtures("swift")
@@ -82,7 +61,7 @@ async def test_a_revoked_vehicle_loses_its_open_stream_and_another_does_not(
         channel_to(server.address, certs("operator-op")) as other,
     ):
         stream = await open_stream(channel, coded.hello)
-        watching = twin_pb2_grpc.TwinServiceStub(other).Watch(subscription_to_wire(Subscription()))
+        watching = watch_call(other)
         await watching.initial_metadata()
         access.write_text('revoked = ["spiffe://rfedge/vehicle/cav-raw"]')
         assert await stream.code() is grpc.StatusCode.UNAUTHENTICATED
@@ -120,7 +99,7 @@ async def test_a_certificate_that_expires_ends_the_stream_that_it_opened(
 
 async def first_picture(address: object, tls: TlsFiles) -> str:
     async with channel_to(address, tls) as channel:
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(Subscription()))
+        call = watch_call(channel)
         async for response in call:
             return twin_message_from_wire(response).vehicle_id
     raise AssertionError("the stream ended")
@@ -165,7 +144,7 @@ async def test_a_grant_that_changes_ends_the_stream_that_had_the_old_one(
         serve(tls=certs("server"), access=access) as server,
         channel_to(server.address, certs("consumer-desk")) as channel,
     ):
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(Subscription()))
+        call = watch_call(channel)
         await call.initial_metadata()
         access.write_text('[consumers.desk]\nvehicles = ["cav-1"]')
         assert await call.code() is grpc.StatusCode.UNAUTHENTICATED
@@ -178,9 +157,7 @@ async def test_a_connection_of_a_great_age_is_renewed(
     monkeypatch.setattr(mec_server.server, "CONNECTION_GRACE_MS", 100)
     async with serve(max_connection_age_s=1.0) as server:
         async with grpc.aio.insecure_channel(str(server.address)) as channel:
-            call = twin_pb2_grpc.TwinServiceStub(channel).Watch(
-                subscription_to_wire(Subscription())
-            )
+            call = watch_call(channel)
             await call.initial_metadata()
             async with asyncio.timeout(30):
                 assert await call.code() is not grpc.StatusCode.OK

@@ -9,6 +9,7 @@ import grpc
 import pytest
 from structlog.testing import capture_logs
 
+from live_server import counted
 from mec_server.config import AdmissionLimits
 from rfcore.wire.conventions import RETRY_AFTER
 from rfcore.wire.messages import Hello, Welcome
@@ -20,10 +21,6 @@ def asking(coded: Any, name: str, rate_hz: float) -> Hello:
     cameras = tuple(replace(camera, rate_hz=rate_hz) for camera in coded.hello.cameras)
     hello: Hello = replace(coded.hello, vehicle_id=name, cameras=cameras)
     return hello
-
-
-def counted(server: Any, name: str, **labels: str) -> float:
-    return float(server.registry.get_sample_value(name, labels) or 0.0)
 
 
 async def test_beyond_capacity_vehicles_are_refused_and_the_first_keeps_its_service(

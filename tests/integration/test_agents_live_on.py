@@ -4,7 +4,7 @@ import asyncio
 import json
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,17 +13,8 @@ from typing import Any
 import grpc
 import pytest
 
+from live_server import until
 from rfcore.wire.conventions import STREAM_METHOD
-
-WITHIN_S = 60.0
-
-
-async def until(condition: Callable[[], Any]) -> Any:
-    """Return the first true value of ``condition``."""
-    async with asyncio.timeout(WITHIN_S):
-        while not (value := condition()):
-            await asyncio.sleep(0.02)
-    return value
 
 
 @dataclass

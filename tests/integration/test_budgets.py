@@ -21,6 +21,7 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from structlog.testing import capture_logs
 
+from live_server import Files, certificates, counted, held, limited, until, watch_call
 from mec_server.config import AdmissionLimits, IdentityBudget, SessionLimits
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
 from mec_server.session import MAX_UNUSABLE, DecodeJob, OpenJob
@@ -30,34 +31,13 @@ from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Ack, Frame, Hello, Nack, Welcome
 from rfcore.wire.publish import Ground, publish
-from rfcore.wire.tls import TlsFiles
-from rfcore.wire.twin import Subscription, subscription_to_wire
 from rfcore.wire.v1 import field_pb2 as pb
-from rfcore.wire.v1 import twin_pb2_grpc
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
-from rfedge.certs import Members, certify, write_certificates
+from rfedge.certs import Members
 
 EXHAUSTED = grpc.StatusCode.RESOURCE_EXHAUSTED
 SHORT = SessionLimits(stalled_s=0.3)
 NOW = datetime(2026, 11, 1, tzinfo=UTC)
-
-
-def counted(server: Any, name: str, **labels: str) -> float:
-    return float(server.registry.get_sample_value(name, labels) or 0.0)
-
-
-def limited(server: Any, limit: str) -> float:
-    return counted(server, "rfedge_server_limited_total", limit=limit)
-
-
-def held(server: Any, resource: str) -> float:
-    return counted(server, "rfedge_server_held", resource=resource)
-
-
-async def until(holds: Callable[[], bool]) -> None:
-    async with asyncio.timeout(30):
-        while not holds():
-            await asyncio.sleep(0.005)
 
 
 def named(hello: Hello, vehicle_id: str, cameras: int = 1, rate_hz: float = 0.0) -> Hello:
@@ -73,11 +53,9 @@ def of_camera(frame: Frame, vehicle_id: str) -> Frame:
 
 
 @pytest.fixture
-def certs(tmp_path: Path) -> Callable[[str], TlsFiles]:
-    root = tmp_path / "certs"
+def certs(tmp_path: Path) -> Files:
     members = Members(("cav-raw", "cav-other"), ("watch", "other"))
-    write_certificates(root, certify(members, datetime.now(UTC), days=30))
-    return lambda name: TlsFiles(root / f"{name}.pem", root / f"{name}.key", root / "ca.pem")
+    return certificates(tmp_path / "certs", members)
 
 
 @pytest.fixture
@@ -242,10 +220,9 @@ async def test_one_identity_does_not_take_every_place_to_watch(
     async with serve(tls=certs("server")) as server, AsyncExitStack() as stack:
         greedy = await stack.enter_async_context(connect(server, "consumer-watch"))
         modest = await stack.enter_async_context(connect(server, "consumer-other"))
-        request = subscription_to_wire(Subscription())
-        calls = [twin_pb2_grpc.TwinServiceStub(greedy).Watch(request) for _ in range(8)]
+        calls = [watch_call(greedy) for _ in range(8)]
         await until(lambda: limited(server, "identity_watches") == 4)
-        call = twin_pb2_grpc.TwinServiceStub(modest).Watch(request)
+        call = watch_call(modest)
         await until(lambda: held(server, "watches") == 5)
         assert not call.done()
         for greedy_call in calls:

@@ -14,7 +14,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import grpc
 import numpy as np
 import pytest
 
@@ -24,7 +23,6 @@ from recorded import recorded
 from rfcore.camera import TileOrigin
 from rfcore.dataset.recorded_session import RecordedPicture
 from rfcore.field import FieldMetadata, SplatField, save_field
-from rfcore.wire.conventions import CHANNEL_OPTIONS
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import (
@@ -32,10 +30,8 @@ from rfcore.wire.twin import (
     PictureEncoding,
     Subscription,
     TwinPicture,
-    subscription_to_wire,
-    twin_message_from_wire,
 )
-from rfcore.wire.v1 import twin_pb2_grpc
+from rfcore.wire.twin_client import AsyncTwinClient
 from rfedge.processes import command_of
 
 BORDER_M = 0.25
@@ -104,11 +100,9 @@ async def roadside(street: Any, tmp_path: Path) -> AsyncIterator[Any]:
 
 async def seen_at(address: str, seen: list[TwinPicture | Departure]) -> None:
     """Collect what a consumer of one server's twin sees."""
-    async with grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
-        stub = twin_pb2_grpc.TwinServiceStub(channel)
-        responses = stub.Watch(subscription_to_wire(Subscription(encoding=PictureEncoding.NONE)))
-        while (response := await responses.read()) is not grpc.aio.EOF:
-            seen.append(twin_message_from_wire(response))
+    async with AsyncTwinClient(address) as client:
+        async for message in client.watch(Subscription(encoding=PictureEncoding.NONE)):
+            seen.append(message)  # noqa: PERF401 - it is read while it grows
 
 
 def stays_ns(seen: list[TwinPicture | Departure]) -> list[tuple[int, int]]:

@@ -12,6 +12,7 @@ import grpc
 import pytest
 from structlog.testing import capture_logs
 
+from live_server import counted, until, watch_call
 from mec_server.config import AdmissionLimits, DecoderKind, LearnSettings, NatsSettings
 from mec_server.connections import ClosedConnections, Connections
 from mec_server.metrics import BackgroundTask
@@ -21,8 +22,6 @@ from mec_server.session import DecodeJob, OpenJob
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.messages import Ack, Frame, Hello
-from rfcore.wire.twin import Subscription, subscription_to_wire
-from rfcore.wire.v1 import twin_pb2_grpc
 
 EVERYBODY = AdmissionLimits(load=0.0)
 SAME_AGENT = ((AGENT_PROCESS, "the same"),)
@@ -65,16 +64,6 @@ def damaged(frame: Frame) -> Frame:
 def with_cameras(hello: Hello, vehicle_id: str, camera_ids: list[str]) -> Hello:
     cameras = tuple(replace(hello.cameras[0], camera_id=name) for name in camera_ids)
     return replace(hello, vehicle_id=vehicle_id, cameras=cameras)
-
-
-def counted(server: Any, name: str, **labels: str) -> float:
-    return float(server.registry.get_sample_value(name, labels) or 0.0)
-
-
-async def until(holds: Callable[[], bool]) -> None:
-    async with asyncio.timeout(30):
-        while not holds():
-            await asyncio.sleep(0.001)
 
 
 # --- frames
@@ -358,8 +347,7 @@ async def consumer_fails(scene: Scene) -> Any:
     scene.patch.setattr("mec_server.twin.service.encoded_picture", surprise)
     async with scene.serve() as server, AsyncExitStack() as stack:
         channel = grpc.aio.insecure_channel(str(server.address))
-        stub = twin_pb2_grpc.TwinServiceStub(await stack.enter_async_context(channel))
-        watching = stub.Watch(subscription_to_wire(Subscription()))
+        watching = watch_call(await stack.enter_async_context(channel))
         await until(lambda: counted(server, "rfedge_twin_consumers") == 1)
         await drive_on(scene, server)
         with pytest.raises(grpc.aio.AioRpcError) as raised:
@@ -520,9 +508,9 @@ async def test_vehicles_and_consumers_that_vanish_are_no_failures(
 ) -> None:
     async with serve(admission=EVERYBODY) as server, AsyncExitStack() as stack:
         channel = grpc.aio.insecure_channel(str(server.address))
-        stub = twin_pb2_grpc.TwinServiceStub(await stack.enter_async_context(channel))
+        await stack.enter_async_context(channel)
         for number in range(8):
-            watching = stub.Watch(subscription_to_wire(Subscription()))
+            watching = watch_call(channel)
             await until(lambda: counted(server, "rfedge_twin_consumers") == 1)
             async with raw_vehicle(server.address) as vehicle:
                 await vehicle.greet(replace(coded.hello, vehicle_id=f"cav-{number}"))

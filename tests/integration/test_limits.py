@@ -7,15 +7,10 @@ from typing import Any
 import grpc
 import pytest
 
+from live_server import limited
 from mec_server.config import IdentityBudget, ServerBudget
-from rfcore.wire.conventions import AGENT_PROCESS, RETRY_AFTER
+from rfcore.wire.conventions import RETRY_AFTER
 from rfcore.wire.messages import Hello, Nack
-
-
-def limited(server: Any, limit: str) -> float:
-    value = server.registry.get_sample_value("rfedge_server_limited_total", {"limit": limit})
-    assert value is not None
-    return float(value)
 
 
 def with_camera(hello: Hello, camera_id: str) -> Hello:
@@ -72,18 +67,6 @@ async def test_frames_beyond_the_rate_are_answered_with_the_limit(
         assert await vehicle.farewell() is grpc.StatusCode.OK
 
 
-async def test_a_stream_of_nothing_but_rubbish_is_ended(
-    coded: Any, serve: Any, raw_vehicle: Any
-) -> None:
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.greet(coded.hello)
-        for _ in range(64):
-            assert (await vehicle.told(b"\xff rubbish"))[0] == "invalid_argument"
-        assert await vehicle.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
-        assert "64 messages in a row" in await vehicle.stream.details()
-        assert limited(server, "unusable_frames") == 1
-
-
 async def test_a_second_agent_for_a_camera_is_refused_with_the_reason_and_when_to_try_again(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
@@ -105,22 +88,6 @@ async def test_a_second_agent_for_a_camera_is_refused_with_the_reason_and_when_t
         assert await first.told(coded.frames[0]) == ("ack", 0), "the first one notices nothing"
 
 
-async def test_streams_of_one_agent_process_may_share_a_camera(
-    coded: Any, serve: Any, raw_vehicle: Any
-) -> None:
-    """It opens the next tile's stream before it closes the last, and reconnects at any time."""
-    agent = ((AGENT_PROCESS, "the same"),)
-    async with (
-        serve() as server,
-        raw_vehicle(server.address, metadata=agent) as first,
-        raw_vehicle(server.address, metadata=agent) as second,
-    ):
-        await first.greet(coded.hello)
-        await second.greet(coded.hello)
-        assert await first.told(coded.frames[0]) == ("ack", 0)
-        assert await second.told(coded.frames[0]) == ("ack", 0)
-
-
 async def test_an_agent_that_fell_silent_is_replaced_by_another_and_told_why(
     coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,21 +103,6 @@ async def test_an_agent_that_fell_silent_is_replaced_by_another_and_told_why(
         assert await silent.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
         assert "another agent sends cav-raw/front now" in await silent.stream.details()
         assert limited(server, "camera_taken") == 1
-
-
-async def test_a_hello_refused_for_its_camera_holds_nothing(
-    coded: Any, serve: Any, raw_vehicle: Any
-) -> None:
-    """Two streams are allowed: one that was refused must not use up the second."""
-    two = IdentityBudget(streams=2)
-    async with serve(identity_budget=two) as server, raw_vehicle(server.address) as first:
-        await first.greet(coded.hello)
-        for _ in range(3):
-            async with raw_vehicle(server.address) as refused:
-                await refused.say(coded.hello)
-                assert await refused.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
-        async with raw_vehicle(server.address) as other:
-            await other.greet(with_camera(coded.hello, "rear"))
 
 
 async def test_a_second_hello_counts_with_its_own_cameras(

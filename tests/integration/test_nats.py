@@ -2,7 +2,7 @@
 
 import asyncio
 import shutil
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -19,6 +19,7 @@ from cav_agent.config import PaceKind
 from lab.servers.cases import ScaleRow
 from lab.servers.nats import NatsServer, nats_rows
 from lab.servers.scale import ScaleJob, run_scale
+from live_server import until
 from mec_server.config import NatsSettings
 from mec_server.nats import NatsLink, fetch_object
 from mec_server.twin.nats import PlaceRecords
@@ -78,12 +79,6 @@ async def reading(servers: NatsServers | str) -> AsyncIterator[Seen]:
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-
-
-async def until(holds: Callable[[], bool]) -> None:
-    async with asyncio.timeout(60):
-        while not holds():
-            await asyncio.sleep(0.01)
 
 
 def named(broker: NatsServer, name: str) -> NatsSettings:

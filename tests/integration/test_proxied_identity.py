@@ -1,9 +1,6 @@
 """A server that was told of a proxy takes its word for who a vehicle is, and nobody else's."""
 
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,33 +10,25 @@ import pytest
 import structlog
 
 import mec_server.server
+from live_server import Files, certificates, channel_to, open_stream
 from mec_server.config import DecoderKind, ServerConfig
 from mec_server.proxies import FORWARDED
 from mec_server.server import EdgeServer
 from rfcore.errors import InvalidInput
-from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
+from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.convert_answers import server_messages_from_bytes
-from rfcore.wire.messages import Welcome
 from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2, field_pb2_grpc
-from rfedge.certs import Members, certify, write_certificates
+from rfedge.certs import Members
 
-Files = Callable[[str], TlsFiles]
 MEMBERS = Members(("cav-raw", "cav-2"), ("desk",), proxies=("edge-proxy",))
 PROXY = {"proxy_identity": ("edge-proxy",), "decoder": DecoderKind.IN_PROCESS}
 
 
 @pytest.fixture
 def certs(tmp_path: Path) -> Files:
-    write_certificates(tmp_path / "certs", certify(MEMBERS, datetime.now(UTC), days=30))
-
-    def files(name: str) -> TlsFiles:
-        root = tmp_path / "certs"
-        return TlsFiles(root / f"{name}.pem", root / f"{name}.key", root / "ca.pem")
-
-    return files
+    return certificates(tmp_path / "certs", MEMBERS)
 
 
 def forwarded(tls: TlsFiles) -> tuple[tuple[str, str], ...]:
@@ -49,23 +38,9 @@ def forwarded(tls: TlsFiles) -> tuple[tuple[str, str], ...]:
     return ((FORWARDED, f'Hash=ab;Cert="{quote(tls.certificate.read_bytes())}";URI={uri}'),)
 
 
-@asynccontextmanager
-async def channel_to(address: object, tls: TlsFiles) -> AsyncIterator[grpc.aio.Channel]:
-    credentials = tls.channel_credentials()
-    async with grpc.aio.secure_channel(str(address), credentials, CHANNEL_OPTIONS) as channel:
-        yield channel
-
-
 async def hello(channel: grpc.aio.Channel, coded: Any, metadata: Any = ()) -> Any:
     stream = channel.stream_stream(STREAM_METHOD)(metadata=metadata)
     await stream.write(client_message_to_bytes(coded.hello))
-    return stream
-
-
-async def welcomed(channel: grpc.aio.Channel, coded: Any, metadata: Any = ()) -> Any:
-    stream = await hello(channel, coded, metadata)
-    (welcome, *_) = server_messages_from_bytes(await stream.read())
-    assert isinstance(welcome, Welcome)
     return stream
 
 
@@ -76,7 +51,7 @@ async def test_a_vehicle_behind_the_proxy_is_whom_the_proxy_says_it_is(
         serve(tls=certs("server"), **PROXY) as server,
         channel_to(server.address, certs("proxy-edge-proxy")) as proxy,
     ):
-        await welcomed(proxy, coded, forwarded(certs("vehicle-cav-raw")))
+        await open_stream(proxy, coded.hello, forwarded(certs("vehicle-cav-raw")))
         for other in ("vehicle-cav-2", "consumer-desk"):
             stream = await hello(proxy, coded, forwarded(certs(other)))
             assert await stream.code() is grpc.StatusCode.PERMISSION_DENIED
@@ -132,7 +107,7 @@ async def test_a_vehicle_behind_the_proxy_is_revoked_alone_and_the_proxy_with_al
         serve(tls=certs("server"), access=access, **PROXY) as server,
         channel_to(server.address, certs("proxy-edge-proxy")) as proxy,
     ):
-        stream = await welcomed(proxy, coded, forwarded(certs("vehicle-cav-raw")))
+        stream = await open_stream(proxy, coded.hello, forwarded(certs("vehicle-cav-raw")))
         access.write_text(f'revoked = ["{revoked}"]')
         assert await stream.code() is grpc.StatusCode.UNAUTHENTICATED
         assert "revoked" in await stream.details()

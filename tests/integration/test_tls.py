@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,42 +12,29 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from cav_agent.config import AgentLimits
+from live_server import Files, certificates, channel_to, watch_call
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
 from rfcore.wire.address import own_problem
-from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
+from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import (
     PictureEncoding,
     Subscription,
     TwinPicture,
-    subscription_to_wire,
     twin_message_from_wire,
 )
 from rfcore.wire.twin_client import TwinClient
-from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.certs import Members, certify, write_certificates
 
-Files = Callable[[str], TlsFiles]
 SOON_S = AgentLimits(give_up_s=5.0)
 
 
 @pytest.fixture
 def authority(tmp_path: Path) -> Callable[..., Files]:
     """Return a function that makes an authority's folder, and one that names files in it."""
-
-    def make(folder: str = "certs", age_days: int = 0) -> Files:
-        now = datetime.now(UTC) - timedelta(days=age_days)
-        issued = certify(Members(("cav-1", "cav-2"), ("watch",)), now, days=30)
-        write_certificates(tmp_path / folder, issued)
-
-        def files(name: str) -> TlsFiles:
-            root = tmp_path / folder
-            return TlsFiles(root / f"{name}.pem", root / f"{name}.key", root / "ca.pem")
-
-        return files
-
-    return make
+    members = Members(("cav-1", "cav-2"), ("watch",))
+    return lambda folder="certs", age_days=0: certificates(tmp_path / folder, members, age_days)
 
 
 @pytest.fixture
@@ -59,11 +46,6 @@ def certs(authority: Any) -> Files:
 def mixed(own: TlsFiles, trusted: TlsFiles) -> TlsFiles:
     """What somebody shows who has a foreign certificate, and trusts the right authority."""
     return replace(own, authority=trusted.authority)
-
-
-def channel_to(address: object, tls: TlsFiles) -> grpc.aio.Channel:
-    credentials = tls.channel_credentials()
-    return grpc.aio.secure_channel(str(address), credentials, options=CHANNEL_OPTIONS)
 
 
 async def test_a_vehicle_with_its_certificate_drives_and_gets_its_field(
@@ -198,9 +180,7 @@ async def test_no_service_answers_without_a_certificate(
                 stub = health_pb2_grpc.HealthStub(channel)
                 call: Any = stub.Check(health_pb2.HealthCheckRequest())
             elif service == "watch":
-                call = twin_pb2_grpc.TwinServiceStub(channel).Watch(
-                    subscription_to_wire(Subscription())
-                )
+                call = watch_call(channel)
             else:
                 call = channel.stream_stream(STREAM_METHOD)()
             assert await call.code() is grpc.StatusCode.UNAVAILABLE
@@ -247,7 +227,7 @@ async def test_a_consumer_asks_for_health_and_sees_the_drive(
         health = await health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest())
         assert health.status == health_pb2.HealthCheckResponse.SERVING
         subscription = Subscription(encoding=PictureEncoding.NONE)
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(subscription))
+        call = watch_call(channel, subscription)
         await call.initial_metadata()
         await travel(server.address, tls=certs("vehicle-cav-1"))
         seen = twin_message_from_wire(await call.read())

@@ -15,31 +15,21 @@ import grpc
 import numpy as np
 import pytest
 
+from live_server import consumer
 from mec_server.config import ServerBudget, SessionLimits
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import read_rgb
-from rfcore.wire.conventions import CHANNEL_OPTIONS
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
     Subscription,
     TwinPicture,
-    subscription_to_wire,
     twin_message_from_wire,
 )
 from rfcore.wire.twin_client import TwinClient
-from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.processes import command_of
 from rfedge.watch import WatchSettings, watch
-
-
-@asynccontextmanager
-async def consumer(address: object, subscription: Subscription) -> AsyncIterator[Any]:
-    async with grpc.aio.insecure_channel(str(address), options=CHANNEL_OPTIONS) as channel:
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(subscription))
-        await call.initial_metadata()
-        yield call
 
 
 async def next_of(call: Any) -> TwinPicture | Departure:

@@ -1,0 +1,80 @@
+"""Helpers for tests that talk to a server in this process: metrics, certificates, consumers."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import grpc
+
+from rfcore.wire.conventions import CHANNEL_OPTIONS, CONSUMER_OPTIONS, STREAM_METHOD
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.messages import Hello, Welcome
+from rfcore.wire.tls import TlsFiles
+from rfcore.wire.twin import Subscription, subscription_to_wire
+from rfcore.wire.v1 import twin_pb2_grpc
+from rfedge.certs import Members, certify, write_certificates
+
+Files = Callable[[str], TlsFiles]
+"""Returns the files of a certificate by its name."""
+
+
+def counted(server: Any, name: str, **labels: str) -> float:
+    """Return a sample of the server's metrics, 0 where it is not there yet."""
+    return float(server.registry.get_sample_value(name, labels) or 0.0)
+
+
+def limited(server: Any, limit: str) -> float:
+    return counted(server, "rfedge_server_limited_total", limit=limit)
+
+
+def held(server: Any, resource: str) -> float:
+    return counted(server, "rfedge_server_held", resource=resource)
+
+
+async def until(condition: Callable[[], Any], within_s: float = 60.0) -> Any:
+    """Return the first true value of ``condition``."""
+    async with asyncio.timeout(within_s):
+        while not (value := condition()):
+            await asyncio.sleep(0.002)
+    return value
+
+
+def certificates(root: Path, members: Members, age_days: int = 0) -> Files:
+    """Make certificates in ``root``; return what finds them."""
+    now = datetime.now(UTC) - timedelta(days=age_days)
+    write_certificates(root, certify(members, now, days=30))
+    return lambda name: TlsFiles(root / f"{name}.pem", root / f"{name}.key", root / "ca.pem")
+
+
+def channel_to(address: object, tls: TlsFiles) -> grpc.aio.Channel:
+    """Return a connection of its own: channels of one certificate share none."""
+    credentials = tls.channel_credentials()
+    return grpc.aio.secure_channel(str(address), credentials, options=CHANNEL_OPTIONS)
+
+
+async def open_stream(channel: grpc.aio.Channel, hello: Hello, metadata: Any = ()) -> Any:
+    """Open a vehicle's stream and expect its Welcome."""
+    stream = channel.stream_stream(STREAM_METHOD)(metadata=metadata)
+    await stream.write(client_message_to_bytes(hello))
+    (welcome, *_) = server_messages_from_bytes(await stream.read())
+    assert isinstance(welcome, Welcome)
+    return stream
+
+
+def watch_call(channel: grpc.aio.Channel, subscription: Subscription | None = None) -> Any:
+    """Return a call of ``TwinService.Watch``."""
+    request = subscription_to_wire(subscription or Subscription())
+    return twin_pb2_grpc.TwinServiceStub(channel).Watch(request)
+
+
+@asynccontextmanager
+async def consumer(address: object, subscription: Subscription | None = None) -> AsyncIterator[Any]:
+    """Watch over a connection of its own; yield the call once the server has accepted it."""
+    async with grpc.aio.insecure_channel(str(address), options=CONSUMER_OPTIONS) as channel:
+        call = watch_call(channel, subscription)
+        await call.initial_metadata()
+        yield call
