@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
-
+from rfcore.errors import InvalidInput
 from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, field_path
+from rfedge.results import check_result_path
 from rfedge.samples import sample_path
 
 __all__ = ["EvalLive"]
+
+KINDS = ("rtsp", "rtp")
+MOST_SECONDS = 86_400.0
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class EvalLive:
     """Live cameras: rtsp, rtp; none: not measured."""
     source_seconds: float = 300.0
     """Duration of each drive at 10 Hz."""
-    kill_every: Annotated[float, arg(metavar="SECONDS")] = 60.0
+    kill_every_s: float = 60.0
     """Its sender is killed so often, and started again."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive, the only one in its folder."""
@@ -47,24 +50,23 @@ class EvalLive:
     out: Annotated[Path, JSON] = Path("out/eval/live.json")
     """The result file to write."""
 
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        if any(not 1 <= count <= 64 for count in self.cameras):
+            raise InvalidInput("cameras", f"{self.cameras} are not all within 1..64")
+        for name in ("hz", "seconds", "source_seconds", "kill_every_s"):
+            if not 0 < getattr(self, name) <= MOST_SECONDS:
+                raise InvalidInput(name, f"{getattr(self, name):g} is outside 0..{MOST_SECONDS:g}")
+        if not 0 <= self.consumers <= 50:
+            raise InvalidInput("consumers", f"{self.consumers} is outside 0..50")
+        for kind in self.sources:
+            if kind not in KINDS:
+                raise InvalidInput("sources", f"{kind!r} is none of {', '.join(KINDS)}")
+
     def run(self) -> None:
         """Measure, print and write the rows."""
         from rich.console import Console
 
-        from lab.live.run import LiveJob, run_live
+        from lab.live.run import run_live
 
-        job = LiveJob(
-            cameras=self.cameras,
-            hz=self.hz,
-            seconds=self.seconds,
-            rounds=self.rounds,
-            consumers=self.consumers,
-            sources=self.sources,
-            source_seconds=self.source_seconds,
-            kill_every_s=self.kill_every,
-            field=field_path(self.field),
-            drive=self.drive,
-            work=self.work,
-            out=self.out,
-        )
-        run_live(job, Console())
+        run_live(replace(self, field=field_path(self.field)), Console())

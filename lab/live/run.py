@@ -20,18 +20,19 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from lab.live import EvalLive
 from lab.live.report import AgeRow, IngestRow, SourceRow, live_parts
 from lab.live.showing import TwinBed, agent, measure_age, measure_ingest, watching
 from lab.soak import slope_per_minute
 from rfcore.dataset import read_dataset
-from rfcore.errors import BackendUnavailable, InvalidInput, RfedgeError
+from rfcore.errors import BackendUnavailable, RfedgeError
 from rfcore.image import jpeg_bytes
 from rfedge.loadtest.usage import Usage, Watcher
 from rfedge.processes import command_of, service
 from rfedge.report.tables import Table
-from rfedge.results import CHECKOUT, check_result_path, make_result, provenance, write_result
+from rfedge.results import CHECKOUT, make_result, provenance, write_result
 
-__all__ = ["LiveCamera", "LiveJob", "measure_source", "run_live"]
+__all__ = ["LiveCamera", "measure_source", "run_live"]
 
 SENDER = CHECKOUT / "deploy/live/gst_sender.py"
 """Runs under the system's Python, which has GStreamer's bindings; it is no part of the package."""
@@ -44,7 +45,6 @@ t=0 0
 m=video {port} RTP/AVP 96
 a=rtpmap:96 H264/90000
 """
-KINDS = ("rtsp", "rtp")
 DOWN_S = 3.0
 """Time for which a killed sender stays away: longer than the agent takes to call its source
 lost."""
@@ -61,10 +61,6 @@ class LiveCamera:
     folder: Path
     seconds: float
     kill_every_s: float
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InvalidInput("sources", f"{self.kind!r} is none of {', '.join(KINDS)}")
 
 
 def write_camera(folder: Path, drive: Path) -> None:
@@ -240,45 +236,11 @@ def _slope(usage: Usage) -> float:
     return slope_per_minute(_settled(usage))
 
 
-MOST_SECONDS = 86_400.0
+def _camera(job: EvalLive, kind: str) -> LiveCamera:
+    return LiveCamera(kind, job.work / kind, job.source_seconds, job.kill_every_s)
 
 
-@dataclass(frozen=True)
-class LiveJob:
-    """The settings of a run: see ``EvalLive``."""
-
-    cameras: tuple[int, ...]
-    hz: float
-    seconds: float
-    rounds: int
-    consumers: int
-    sources: tuple[str, ...]
-    source_seconds: float
-    kill_every_s: float
-    field: Path
-    drive: Path
-    work: Path
-    out: Path
-
-    def __post_init__(self) -> None:
-        check_result_path(self.out)
-        if any(not 1 <= count <= 64 for count in self.cameras):
-            raise InvalidInput("cameras", f"{self.cameras} are not all within 1..64")
-        for name in ("hz", "seconds", "source_seconds", "kill_every_s"):
-            if not 0 < getattr(self, name) <= MOST_SECONDS:
-                raise InvalidInput(name, f"{getattr(self, name):g} is outside 0..{MOST_SECONDS:g}")
-        if not 0 <= self.consumers <= 50:
-            raise InvalidInput("consumers", f"{self.consumers} is outside 0..50")
-        for kind in self.sources:
-            self.camera(kind)
-
-    def camera(self, kind: str) -> LiveCamera:
-        """Return a live camera of this job."""
-        folder = self.work / kind
-        return LiveCamera(kind, folder, self.source_seconds, self.kill_every_s)
-
-
-def run_live(job: LiveJob, console: Console) -> None:
+def run_live(job: EvalLive, console: Console) -> None:
     """Measure every part that was asked for, print it, and write the result."""
     bed = TwinBed(job.field, job.drive, job.work, job.hz, job.seconds)
     ages: list[AgeRow] = []
@@ -291,7 +253,7 @@ def run_live(job: LiveJob, console: Console) -> None:
         _print(console, "ingest", ingest[0])
     sources: list[SourceRow] = []
     for kind in job.sources:
-        sources.append(measure_source(job.camera(kind), job.drive, job.field, job.work))
+        sources.append(measure_source(_camera(job, kind), job.drive, job.field, job.work))
         _print(console, "sources", sources[-1])
     content = {"settings": asdict(job), "ages": ages, "ingest": ingest, "sources": sources}
     write_result(job.out, make_result("live", provenance([job.field, job.drive]), content))

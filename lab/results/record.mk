@@ -188,7 +188,7 @@ $(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) $(FIELDS) | $(OU
 		dusk=$(call drive,dusk),$(SAMPLE)$(ROWS) lane=$(call drive,lane-1.5),$(SAMPLE)$(ROWS) \
 		--tries 100 --false-starts 50 --seed 2 $(STRANGERS) --cells $(OUT)/localise --out $@
 $(OUT)/rig.json: $(OUT)/rig/rig.toml $(OUT)/rig18/rig.toml
-	$(LAB) rig --rig $(OUT)/rig --many $(OUT)/rig18 --link-bps 300000 --rate 2 --max-delay-ms 2500 --work $(OUT)/rig-work --out $@
+	$(LAB) rig --rig $(OUT)/rig --many $(OUT)/rig18 --link-bps 300000 --rate-hz 2 --max-delay-ms 2500 --work $(OUT)/rig-work --out $@
 $(OUT)/rig/rig.toml: | $(OUT)
 	$(STREETGEN) build samples/street/vehicles.toml --split rig --spp 9 --out $(@D)
 $(OUT)/rig18/rig.toml: | $(OUT)

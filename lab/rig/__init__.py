@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rfedge.samples import sample_path
@@ -28,7 +28,7 @@ class EvalRig:
     """The field archive (.rff) both ends hold."""
     link_bps: float = 4e6
     """Rate of the link, both directions, bit/s."""
-    rate: float = 2.0
+    rate_hz: float = 2.0
     """Instants a second of the second comparison, Hz."""
     max_delay_ms: float = 1000.0
     """Time from capture to Ack, in the second comparison."""
@@ -48,28 +48,16 @@ class EvalRig:
         from rich.console import Console
 
         from lab.rig.report import rig_parts
-        from lab.rig.run import RigJob, run_rig
+        from lab.rig.run import run_rig
         from rfcore.dataset.rig import read_rig
         from rfedge.arguments import field_path
         from rfedge.report.tables import Table
         from rfedge.results import write_result
 
-        job = RigJob(
-            rig=self.rig,
-            many=self.many,
-            field=field_path(self.field),
-            link_bps=self.link_bps,
-            rate_hz=self.rate,
-            max_delay_ms=self.max_delay_ms,
-            crf=self.crf,
-            effort=self.effort,
-            threads=self.threads,
-            work=self.work,
-        )
         for path in filter(None, (self.rig, self.many)):
             read_rig(path)
         console = Console()
-        result = run_rig(job, console)
+        result = run_rig(replace(self, field=field_path(self.field)), console)
         write_result(self.out, result)
         for part in rig_parts(result):
             if isinstance(part, Table):

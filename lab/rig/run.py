@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from lab.rig import EvalRig
 from lab.rig.report import CameraRow, SessionRow
 from rfcore.dataset.rig import Rig, RigCamera, RigInstant, read_rig, read_rig_drive
 from rfcore.errors import RfedgeError
@@ -32,7 +33,7 @@ from rfcore.wire.twin_client import TwinClient
 from rfedge.processes import Service, command_of, service
 from rfedge.results import Result, as_json, make_result, provenance
 
-__all__ = ["RigJob", "Spread", "TwinKeeper", "instants_apart", "run_rig", "spreads_of"]
+__all__ = ["Spread", "TwinKeeper", "instants_apart", "run_rig", "spreads_of"]
 
 
 class TwinKeeper:
@@ -102,22 +103,6 @@ Line = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class RigJob:
-    """The settings of a run; see ``lab.rig.EvalRig``."""
-
-    rig: Path
-    many: Path | None
-    field: Path
-    link_bps: float
-    rate_hz: float
-    max_delay_ms: float
-    crf: float
-    effort: str
-    threads: int
-    work: Path
-
-
-@dataclass(frozen=True)
 class Case:
     """One way to send the cameras of ``rig``; ``together``: in one session."""
 
@@ -142,7 +127,7 @@ class Outcome:
     agent_mb: float
 
 
-def run_rig(job: RigJob, console: Console) -> Result:
+def run_rig(job: EvalRig, console: Console) -> Result:
     """Run every case; return the result. Raises ``RfedgeError`` naming what failed."""
     job.work.mkdir(parents=True, exist_ok=True)
     rows: list[CameraRow] = []
@@ -154,16 +139,16 @@ def run_rig(job: RigJob, console: Console) -> Result:
         found = _measured(case, rig, drive, _outcome(job, case, rig))
         rows += found[0]
         sessions.append(found[1])
-    settings = {name: value for name, value in asdict(job).items() if name != "work"}
+    settings = {name: value for name, value in asdict(job).items() if name not in ("out", "work")}
     content = {
-        "settings": {name: str(v) if isinstance(v, Path) else v for name, v in settings.items()},
+        "settings": as_json(settings),
         "sessions": as_json(sessions),
         "rows": as_json(rows),
     }
     return make_result("rig", provenance([job.field]), content)
 
 
-def _cases(job: RigJob) -> list[Case]:
+def _cases(job: EvalRig) -> list[Case]:
     crf = ("--pace", "lockstep")
     delay = ("--rate", f"{job.rate_hz:g}", "--max-delay-ms", f"{job.max_delay_ms:g}")
     cases = [
@@ -177,7 +162,7 @@ def _cases(job: RigJob) -> list[Case]:
     return cases
 
 
-def _outcome(job: RigJob, case: Case, rig: Rig) -> Outcome:
+def _outcome(job: EvalRig, case: Case, rig: Rig) -> Outcome:
     """Run server, link and vehicles; return what they did."""
     work = job.work
     server = [*command_of("mec-server"), "--fields", str(_fields(job)), "--listen", "127.0.0.1:0"]
@@ -198,7 +183,7 @@ def _outcome(job: RigJob, case: Case, rig: Rig) -> Outcome:
     )
 
 
-def _fields(job: RigJob) -> Path:
+def _fields(job: EvalRig) -> Path:
     """Return a folder that holds the field alone."""
     folder = job.work / "fields"
     folder.mkdir(exist_ok=True)
@@ -208,12 +193,12 @@ def _fields(job: RigJob) -> Path:
     return folder
 
 
-def _link_command(job: RigJob, server: Service, report: Path) -> list[str]:
+def _link_command(job: EvalRig, server: Service, report: Path) -> list[str]:
     rates = ["--uplink-bps", f"{job.link_bps:g}", "--downlink-bps", f"{job.link_bps:g}"]
     return [*command_of("rfedge"), "link", "--to", server.address, *rates, "--report", str(report)]
 
 
-def _vehicles(job: RigJob, case: Case, rig: Rig, link: Service) -> dict[str, list[str]]:
+def _vehicles(job: EvalRig, case: Case, rig: Rig, link: Service) -> dict[str, list[str]]:
     """Return the command of each vehicle by its name: one for all cameras, or one for each."""
     common = [*command_of("cav-agent"), "--server", link.address, "--fields", str(_fields(job))]
     common += ["--crf", f"{job.crf:g}", "--effort", job.effort]

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import arg
 
+from rfcore.errors import InvalidInput
 from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, field_path
 from rfedge.samples import sample_path
-
-if TYPE_CHECKING:
-    from lab.servers.scale import Case
 
 __all__ = ["EvalScale"]
 
@@ -33,8 +31,8 @@ class EvalScale:
     """In each a server is killed, one added, one drained, and one added."""
     hz: float = 2.0
     """Pictures per second of each vehicle."""
-    size: str = "160x90"
-    """WIDTHxHEIGHT that the drive's pictures are reduced to."""
+    size: str | None = "160x90"
+    """WIDTHxHEIGHT that the drive's pictures are reduced to; None: they stay as they are."""
     pairs: int = 5
     """Pairs of runs of one vehicle, straight to a server and through Envoy; 0: none."""
     seconds: float = 30.0
@@ -42,9 +40,11 @@ class EvalScale:
     NATS is restarted."""
     planned: tuple[int, ...] = ()
     """Numbers of prerecorded vehicles, such as 12 24 48, whose cores, bytes and ages are compared
-    with what the flow model of `rfedge size --city` says."""
+    with what the flow model of `rfedge-lab city` says."""
     planned_hz: float = 3.0
     """Pictures per second of each of those."""
+    planned_warm_up_s: float = 5.0
+    """Seconds before they are counted."""
     planned_runs: int = 3
     """How often each of these loads is run; the medians count."""
     envoy: bool = True
@@ -54,12 +54,13 @@ class EvalScale:
     nats: bool = False
     """Also restart the NATS that two servers publish to, `rounds` times (Debian's nats-server)."""
     ray_tiles: Annotated[Path | None, FOLDER] = None
-    """Also train the tiles that `rfedge scene split` put there: one after another, on a Ray started
-    here, and again with a worker killed; needs rfedge[ray], and three trainings' time."""
+    """Also train the tiles that `rfedge dataset split` put there: one after another, on a Ray that
+    is started here, and again with a worker killed. Needs rfedge[ray] and the time of three
+    trainings."""
     ray_iterations: int = 2000
     """Iterations of each of those."""
     city: Annotated[Path | None, arg(metavar="CITY.toml")] = None
-    """Also time `rfedge size --city` of this city, such as samples/sizing/metropolis.toml."""
+    """Also time `rfedge-lab city` of this city, such as samples/sizing/metropolis.toml."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive that the servers publish."""
     drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
@@ -73,50 +74,32 @@ class EvalScale:
     add: bool = False
     """Keep that file's rows of other cases, if they are of this host and field."""
 
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("vehicles", self.vehicles, 2, 200),
+            ("servers", self.servers, 2, 20),
+            ("rounds", self.rounds, 1, 100),
+            ("pairs", self.pairs, 0, 100),
+        ):
+            if not low <= value <= high:
+                raise InvalidInput(name, f"{value} is outside {low}..{high}")
+        if not self.seconds > 0:
+            raise InvalidInput("seconds", f"{self.seconds:g} must be above 0 s")
+
+    @property
+    def reduced(self) -> Path:
+        """The drive in the size that is sent."""
+        return self.work / "drive"
+
+    @property
+    def published(self) -> Path:
+        """The folder that the servers publish."""
+        return self.work / "published"
+
     def run(self) -> None:
         """Measure, print and write the rows."""
         from rich.console import Console
 
-        from lab.servers.scale import ScaleJob, run_scale
-        from rfedge.arguments import parse_size
+        from lab.servers.scale import run_scale
 
-        job = ScaleJob(
-            vehicles=self.vehicles,
-            servers=self.servers,
-            rounds=self.rounds,
-            hz=self.hz,
-            size_px=parse_size(self.size),
-            pairs=self.pairs,
-            seconds=self.seconds,
-            field=field_path(self.field),
-            drive=self.drive,
-            config=self.config / "envoy.yaml",
-            work=self.work,
-            out=self.out,
-            planned=self.planned,
-            planned_hz=self.planned_hz,
-            planned_runs=self.planned_runs,
-            envoy=self.envoy,
-            moves=self.moves,
-            also=self._further_cases(),
-            add=self.add,
-        )
-        run_scale(job, Console())
-
-    def _further_cases(self) -> tuple[Case, ...]:
-        cases: list[Case] = []
-        if self.nats:
-            from lab.servers.nats import nats_rows
-
-            cases.append(nats_rows)
-        if self.ray_tiles is not None:
-            from lab.servers.ray import ray_case
-            from rfcore.extras import require
-
-            require("ray", "ray")
-            cases.append(ray_case(self.ray_tiles, self.ray_iterations))
-        if self.city is not None:
-            from lab.servers.scale import city_case
-
-            cases.append(city_case(self.city))
-        return tuple(cases)
+        run_scale(replace(self, field=field_path(self.field)), Console())

@@ -17,8 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
+from lab.servers import EvalScale
 from lab.servers.cases import Measured, ScaleRow
-from lab.servers.scale import Fleet, Lines, ScaleJob, failures, p99
+from lab.servers.fleet import Fleet, Lines, failures, p99
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.nats import NatsServers
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
@@ -131,10 +132,10 @@ class _Watched:
         return {name: at_s for name, at_s in tuple(self.newest_s.items()) if at_s >= since_s}
 
 
-def nats_rows(job: ScaleJob) -> Measured:
+def nats_rows(job: EvalScale) -> Measured:
     """Restart NATS ``job.rounds`` times while vehicles stream; return what that did."""
     job.work.mkdir(parents=True, exist_ok=True)
-    fleet = Fleet(job, job.work / "vehicles")
+    fleet = Fleet(job.reduced, job.work / "vehicles")
     with ExitStack() as stack:
         nats = stack.enter_context(NatsServer(job.work / "nats"))
         for number, name in enumerate(SERVERS):
@@ -183,7 +184,7 @@ def _ways_ms(lines: Lines, since_ns: int, until_ns: int) -> Iterator[float]:
             yield line["stage_ms"]["link"] + line["stage_ms"]["server_total"]
 
 
-def _command(job: ScaleJob, name: str, url: str) -> list[str]:
+def _command(job: EvalScale, name: str, url: str) -> list[str]:
     where = ("--fields", str(job.published), "--listen", "127.0.0.1:0")
     return [*command_of("mec-server"), *where, "--nats", url, "--nats-name", name]
 

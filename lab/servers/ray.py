@@ -19,8 +19,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from lab.servers import EvalScale
 from lab.servers.cases import Measured, RayTiles, ScaleRow
-from lab.servers.scale import Case, ScaleJob
+from lab.servers.scale import Case
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.split import LIST_NAME, read_tiles
 from rfedge.processes import command_of
@@ -161,7 +162,7 @@ def ray_case(tiles: Path, iterations: int) -> Case:
     return partial(_measure, tiles, listed[0].name, RayTiles(len(listed), digest, iterations))
 
 
-def _measure(tiles: Path, first: str, trained: RayTiles, job: ScaleJob) -> Measured:
+def _measure(tiles: Path, first: str, trained: RayTiles, job: EvalScale) -> Measured:
     folder = job.work / "ray"
     shutil.rmtree(folder, ignore_errors=True)
     every = str(trained.iterations // CHECKPOINTS)

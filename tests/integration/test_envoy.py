@@ -19,6 +19,7 @@ from grpc_health.v1 import health_pb2
 from rich.console import Console
 
 from cav_agent.config import AgentLimits, PaceKind
+from lab.servers import EvalScale
 from lab.servers.cases import ScaleRow
 from lab.servers.envoy import (
     CLUSTER,
@@ -29,7 +30,8 @@ from lab.servers.envoy import (
     envoy_binary,
     run_envoy,
 )
-from lab.servers.scale import ScaleJob, resumed_s, run_scale
+from lab.servers.fleet import resumed_s
+from lab.servers.scale import run_scale
 from mec_server.proxies import FORWARDED
 from rfcore.errors import RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD, TILE
@@ -365,9 +367,9 @@ async def test_each_group_takes_the_vehicles_of_its_tiles_and_none_falls_with_an
 @pytest.mark.timeout(300)
 def test_the_cases_are_measured_with_vehicles_as_processes(street: Any, tmp_path: Path) -> None:
     """Times and losses depend on the machine, and are left to the figures."""
-    job = ScaleJob(
-        vehicles=4, servers=2, rounds=1, hz=1.0, size_px=None, pairs=0, seconds=3.0,
-        field=street.store / "street.rff", drive=street.drive, config=DEPLOY / "envoy.yaml",
+    job = EvalScale(
+        vehicles=4, servers=2, rounds=1, hz=1.0, size=None, pairs=0, seconds=3.0,
+        field=street.store / "street.rff", drive=street.drive, config=DEPLOY,
         work=tmp_path / "work", out=tmp_path / "scale.json",
     )  # fmt: skip
     try:

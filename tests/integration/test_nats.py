@@ -16,9 +16,10 @@ from rich.console import Console
 from structlog.testing import capture_logs
 
 from cav_agent.config import PaceKind
+from lab.servers import EvalScale
 from lab.servers.cases import ScaleRow
-from lab.servers.nats import NatsServer, nats_rows
-from lab.servers.scale import ScaleJob, run_scale
+from lab.servers.nats import NatsServer
+from lab.servers.scale import run_scale
 from live_server import until
 from mec_server.config import NatsSettings
 from mec_server.nats import NatsLink, fetch_object
@@ -402,10 +403,10 @@ def test_the_case_is_measured_with_servers_and_vehicles_as_processes(
     street: Any, tmp_path: Path
 ) -> None:
     """Times depend on the machine, and are left to the figures."""
-    job = ScaleJob(
-        vehicles=4, servers=2, rounds=1, hz=2.0, size_px=None, pairs=0, seconds=1.0,
+    job = EvalScale(
+        vehicles=4, servers=2, rounds=1, hz=2.0, size=None, pairs=0, seconds=1.0,
         field=street.store / "street.rff", drive=street.drive, config=DEPLOY,
-        work=tmp_path / "work", out=tmp_path / "scale.json", envoy=False, also=(nats_rows,),
+        work=tmp_path / "work", out=tmp_path / "scale.json", envoy=False, nats=True,
     )  # fmt: skip
     try:
         run_scale(job, Console(quiet=True))

@@ -1,29 +1,13 @@
 """Live measurements: what is asked for is checked before anything starts."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from lab.live.run import LiveJob
+from lab.live import EvalLive
 from lab.live.showing import percentiles
 from rfcore.errors import InvalidInput
-
-JOB = LiveJob(
-    cameras=(1, 4),
-    hz=2.0,
-    seconds=10.0,
-    rounds=1,
-    consumers=10,
-    sources=("rtsp",),
-    source_seconds=300.0,
-    kill_every_s=60.0,
-    field=Path("f.rff"),
-    drive=Path("d.json"),
-    work=Path("work"),
-    out=Path("live.json"),
-)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +25,7 @@ def test_what_cannot_be_measured_is_refused_before_anything_starts(
     change: dict[str, Any], problem: str
 ) -> None:
     with pytest.raises(InvalidInput, match=problem):
-        replace(JOB, **change)
+        EvalLive(**change)
 
 
 def test_percentiles_of_nothing_are_none() -> None:

@@ -15,8 +15,9 @@ from lab.city.planned_load import (
     fitted_costs,
     planned_figures,
 )
+from lab.servers import EvalScale
 from lab.servers.cases import ScaleRow
-from lab.servers.scale import ScaleJob, run_scale
+from lab.servers.scale import run_scale
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.convert import convert_dataset
 from rfedge.loadtest.run import TestBed
@@ -66,8 +67,8 @@ def test_a_small_load_is_compared_with_its_plan(tmp_path: Path) -> None:
     drive = tmp_path / "small"
     pictures = sample_path("street/transforms_drive_vehicles.json")
     convert_dataset(pictures, drive, (160, 90), slice(None, 6))
-    job = ScaleJob(
-        vehicles=2, servers=2, rounds=1, hz=1.0, size_px=None, pairs=0, seconds=3.0,
+    job = EvalScale(
+        vehicles=2, servers=2, rounds=1, hz=1.0, size=None, pairs=0, seconds=3.0,
         field=fields / "street.rff", drive=drive, config=tmp_path, work=tmp_path / "work",
         out=tmp_path / "scale.json", planned=(12,), planned_hz=2.0, envoy=False,
         planned_warm_up_s=1.0, planned_runs=1,
@@ -87,8 +88,4 @@ def test_a_small_load_is_compared_with_its_plan(tmp_path: Path) -> None:
 
 def test_nothing_to_measure_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="nothing is to be measured"):
-        ScaleJob(
-            vehicles=2, servers=2, rounds=1, hz=1.0, size_px=None, pairs=0, seconds=3.0,
-            field=tmp_path, drive=tmp_path, config=tmp_path, work=tmp_path,
-            out=tmp_path / "scale.json", envoy=False,
-        )  # fmt: skip
+        run_scale(EvalScale(envoy=False, work=tmp_path / "work"), Console(quiet=True))
