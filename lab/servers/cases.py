@@ -7,12 +7,13 @@ and keep the others' rows. Its result holds, next to the rows, which run each is
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from lab.city.planned_load import PlannedRow
 from lab.report import Report, folded
+from lab.servers import EvalScale
 from rfcore.errors import InvalidInput
 from rfedge.report.tables import Table, columns, shown
 from rfedge.results import Provenance, Result, make_result, read_result, rows_of, write_result
@@ -20,6 +21,7 @@ from rfedge.results import Provenance, Result, make_result, read_result, rows_of
 __all__ = [
     "SCALE",
     "WORLD",
+    "Case",
     "Measured",
     "RayTiles",
     "ScaleRecord",
@@ -72,6 +74,10 @@ class Measured:
     """Difference of the p99 through Envoy and straight, for each pair of runs."""
     ray: Sequence[RayTiles] = ()
     """The tiles that the rows of Ray are of: one, or none."""
+
+
+Case = Callable[[EvalScale], Measured]
+"""Runs one group of cases, and returns what was measured."""
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from lab.servers import EvalScale
-from lab.servers.cases import Measured, RayTiles, ScaleRow
-from lab.servers.scale import Case
+from lab.servers.cases import Case, Measured, RayTiles, ScaleRow
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.split import LIST_NAME, read_tiles
 from rfedge.processes import command_of

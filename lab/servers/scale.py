@@ -10,7 +10,6 @@ import signal
 import statistics
 import subprocess
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -20,7 +19,7 @@ from rich.console import Console
 from lab.city.check import CheckRow, largest_differences
 from lab.city.planned_load import PlannedLoad, compare_with_plan
 from lab.servers import EvalScale
-from lab.servers.cases import Measured, ScaleRecord, ScaleRow
+from lab.servers.cases import Case, Measured, ScaleRecord, ScaleRow
 from lab.servers.envoy import PROXIED, Envoy, EnvoySetup, ServerGroup, envoy_binary
 from lab.servers.fleet import (
     WAIT_S,
@@ -44,7 +43,7 @@ from rfedge.report.tables import Table, columns
 from rfedge.results import provenance, read_result, rows_of
 from rfedge.samples import sample_path
 
-__all__ = ["Case", "cases_of", "planned_load", "run_scale"]
+__all__ = ["cases_of", "planned_load", "run_scale"]
 
 MOST_OVER_MEAN = 1.5
 RESUME_S = 1.0
@@ -54,9 +53,6 @@ PLANNED_PERCENT, PLANNED_AGE_PERCENT = 15.0, 25.0
 CITY_S = 600.0
 PAIR_HZ = 10.0
 EVERYWHERE = Ground(Area((-1e4, -1e4), (1e4, 1e4)), 0.0)
-
-Case = Callable[[EvalScale], Measured]
-"""Runs further processes, and returns what was measured."""
 
 
 def run_scale(job: EvalScale, console: Console) -> None:
