@@ -244,6 +244,7 @@ class RawVehicle:
 
     def __init__(self, stream: grpc.aio.StreamStreamCall[bytes, bytes]) -> None:
         self.stream = stream
+        self.server: EdgeServer | None = None
 
     async def say(self, message: Hello | Frame | bytes) -> None:
         """Send a message, or bytes that only claim to be one."""
@@ -304,6 +305,15 @@ def raw_vehicle() -> Callable[..., Any]:
             yield RawVehicle(channel.stream_stream(STREAM_METHOD)(metadata=metadata))
 
     return run
+
+
+@pytest.fixture
+async def welcomed(coded: CodedStreet, serve: Any, raw_vehicle: Any) -> AsyncIterator[RawVehicle]:
+    """A raw vehicle that a server has welcomed."""
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        vehicle.server = server
+        yield vehicle
 
 
 class Driving:

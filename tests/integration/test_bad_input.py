@@ -47,7 +47,7 @@ def changed(frame: Frame, **fields: float) -> bytes:
 
 
 async def test_damaged_packets_are_refused_and_the_next_is_right_again(
-    coded: Any, serve: Any, raw_vehicle: Any
+    coded: Any, welcomed: Any
 ) -> None:
     """Every frame of this list is answered; what is acknowledged is what the vehicle meant."""
     f = coded.frames
@@ -67,33 +67,29 @@ async def test_damaged_packets_are_refused_and_the_next_is_right_again(
         (b"", "invalid_argument"),
         (f[3], "ack"),
     ]
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.greet(coded.hello)
-        heard = [(await vehicle.told(message))[0] for message, _ in said]
-        assert heard == [reason for _, reason in said]
-        await vehicle.say(f[5])
-        gap, ack = await vehicle.hear(), await vehicle.hear()
-        assert isinstance(gap, Nack)
-        assert (str(gap.reason), gap.address.sequence, gap.count) == ("sequence_gap", 4, 1)
-        assert isinstance(ack, Ack)
-        assert ack.reconstruction_digest == f[5].packet.reconstruction_digest
-        assert await vehicle.farewell() is grpc.StatusCode.OK
+    heard = [(await welcomed.told(message))[0] for message, _ in said]
+    assert heard == [reason for _, reason in said]
+    await welcomed.say(f[5])
+    gap, ack = await welcomed.hear(), await welcomed.hear()
+    assert isinstance(gap, Nack)
+    assert (str(gap.reason), gap.address.sequence, gap.count) == ("sequence_gap", 4, 1)
+    assert isinstance(ack, Ack)
+    assert ack.reconstruction_digest == f[5].packet.reconstruction_digest
+    assert await welcomed.farewell() is grpc.StatusCode.OK
 
 
 async def test_no_flipped_bit_becomes_a_wrong_picture_even_when_its_crc_was_repaired(
-    coded: Any, serve: Any, raw_vehicle: Any
+    coded: Any, welcomed: Any
 ) -> None:
     right = coded.frames[0].packet.reconstruction_digest
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.greet(coded.hello)
-        for number, bit in enumerate(range(0, 8 * len(coded.frames[0].packet.payload), 997)):
-            frame = coded.frames[0]
-            frame = replace(frame, packet=replace(frame.packet, epoch=number))
-            answer = await vehicle.ask(repaired(flipped(frame, bit)))
-            if isinstance(answer, Ack):
-                assert answer.reconstruction_digest == right
-            else:
-                assert isinstance(answer, Nack)
+    for number, bit in enumerate(range(0, 8 * len(coded.frames[0].packet.payload), 997)):
+        frame = coded.frames[0]
+        frame = replace(frame, packet=replace(frame.packet, epoch=number))
+        answer = await welcomed.ask(repaired(flipped(frame, bit)))
+        if isinstance(answer, Ack):
+            assert answer.reconstruction_digest == right
+        else:
+            assert isinstance(answer, Nack)
 
 
 @pytest.mark.parametrize(
@@ -106,15 +102,13 @@ async def test_no_flipped_bit_becomes_a_wrong_picture_even_when_its_crc_was_repa
     ],
 )
 async def test_a_bad_pose_is_an_invalid_argument_naming_the_field(
-    coded: Any, serve: Any, raw_vehicle: Any, fields: dict[str, float], named: str
+    coded: Any, welcomed: Any, fields: dict[str, float], named: str
 ) -> None:
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.greet(coded.hello)
-        identity = {"rotation_w": 1.0, "rotation_x": 0.0, "rotation_y": 0.0, "rotation_z": 0.0}
-        nack = await vehicle.ask(changed(coded.frames[0], **{**identity, **fields}))
-        assert isinstance(nack, Nack)
-        assert nack.problem.startswith(named)
-        assert await vehicle.told(coded.frames[0]) == ("ack", 0)
+    identity = {"rotation_w": 1.0, "rotation_x": 0.0, "rotation_y": 0.0, "rotation_z": 0.0}
+    nack = await welcomed.ask(changed(coded.frames[0], **{**identity, **fields}))
+    assert isinstance(nack, Nack)
+    assert nack.problem.startswith(named)
+    assert await welcomed.told(coded.frames[0]) == ("ack", 0)
 
 
 async def test_a_hello_of_another_resolution_is_refused_by_name_and_may_be_corrected(
@@ -188,16 +182,12 @@ async def test_a_frame_before_hello_is_a_failed_precondition(
         assert "before Hello" in await vehicle.stream.details()
 
 
-async def test_a_draining_server_answers_what_it_has_taken(
-    coded: Any, serve: Any, raw_vehicle: Any
-) -> None:
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.greet(coded.hello)
-        await vehicle.say(coded.frames[0])
-        await vehicle.say(coded.frames[1])
-        first = await vehicle.hear()
-        draining = asyncio.create_task(server.stop())
-        second = await vehicle.hear()
-        assert [a.address.sequence for a in (first, second) if isinstance(a, Ack)] == [0, 1]
-        assert await vehicle.end() is grpc.StatusCode.OK
-        await draining
+async def test_a_draining_server_answers_what_it_has_taken(coded: Any, welcomed: Any) -> None:
+    await welcomed.say(coded.frames[0])
+    await welcomed.say(coded.frames[1])
+    first = await welcomed.hear()
+    draining = asyncio.create_task(welcomed.server.stop())
+    second = await welcomed.hear()
+    assert [a.address.sequence for a in (first, second) if isinstance(a, Ack)] == [0, 1]
+    assert await welcomed.end() is grpc.StatusCode.OK
+    await draining
