@@ -161,7 +161,7 @@ def by_light(
         else:
             new.append([one])
     yield from known.items()
-    taken = {versions.label(n + 1).light for n in range(len(versions.field_ids))}
+    taken = {version.label.light for version in versions.versions}
     for group in new:
         name = _unused(f"h{int(hour_of(group[0].first_ns)):02}", taken)
         taken.add(name)

@@ -214,7 +214,7 @@ class TileLearner:
         for light in ("", *versions.lights):
             number = versions.lights[light] if light else versions.current
             for one in self.history.learnt:
-                if one.field_id == versions.field_ids[number - 1] and not one.withdrawn:
+                if one.field_id == versions.version(number).field_id and not one.withdrawn:
                     yield one
 
     def _check(self, one: Learnt) -> None:
@@ -460,7 +460,7 @@ class TileLearner:
 
 
 def _id(versions: TileVersions, number: int) -> str:
-    return versions.field_ids[number - 1]
+    return versions.version(number).field_id
 
 
 def _identities(passes: Sequence[Pass]) -> frozenset[str]:

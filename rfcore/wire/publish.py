@@ -20,6 +20,7 @@ from rfcore.field.interface import base_of
 from rfcore.wire.tile_manifest import (
     OWN_LIGHT,
     Publication,
+    TileVersion,
     TileVersions,
     VersionLabel,
     read_publication,
@@ -95,7 +96,7 @@ def roll_back(folder: Path, name: str, to: int | None = None, light: str = "") -
         versions = publication.tiles[name]
         wanted = _wanted(versions, name, to, light)
         if wanted is not None:
-            field_id = versions.field_ids[wanted - 1]
+            field_id = versions.version(wanted).field_id
             if field_id not in FieldStore(folder).ids():
                 raise UnknownField(f"version {wanted} of {name!r}, field {field_id}, is gone")
         return _write(folder, publication, name, versions.having(light, wanted))
@@ -121,13 +122,13 @@ def _wanted(versions: TileVersions, name: str, to: int | None, light: str) -> in
 def _next(
     versions: TileVersions | None, field_id: str, now: datetime, label: VersionLabel
 ) -> TileVersions:
-    time = now.isoformat(timespec="seconds")
+    version = TileVersion(field_id, now.isoformat(timespec="seconds"), label)
     if versions is None:
-        return TileVersions((field_id,), (time,), 1, labels=(label,))
+        return TileVersions((version,), 1)
     current = versions.lights.get(label.light, 0) if label.light else versions.current
-    if current and versions.field_ids[current - 1] == field_id:
+    if current and versions.version(current).field_id == field_id:
         return versions
-    return versions.with_version(field_id, time, label)
+    return versions.followed_by(version)
 
 
 def _write(folder: Path, publication: Publication, name: str, versions: TileVersions) -> Tile:

@@ -22,6 +22,7 @@ __all__ = [
     "MANIFEST",
     "OWN_LIGHT",
     "Publication",
+    "TileVersion",
     "TileVersions",
     "VersionLabel",
     "read_publication",
@@ -49,58 +50,59 @@ OWN_LIGHT = VersionLabel()
 
 
 @dataclass(frozen=True)
-class TileVersions:
-    """All versions of one tile, from number 1 on; ``times`` (ISO 8601) are when each was published.
+class TileVersion:
+    """One version of a tile: its field, when it was published (ISO 8601), and its light."""
 
-    ``labels`` has one for each version, or none at all if all are the tile's own. ``current`` is
-    the tile's own field, ``lights`` the current version of each other light.
+    field_id: str
+    published: str
+    label: VersionLabel = OWN_LIGHT
+
+    def __post_init__(self) -> None:
+        check_field_id("tile.versions", self.field_id)
+
+
+@dataclass(frozen=True)
+class TileVersions:
+    """All versions of one tile, in order; the first has number 1.
+
+    ``current`` is the number of the tile's own field, ``lights`` that of each other light.
     """
 
-    field_ids: tuple[str, ...]
-    times: tuple[str, ...]
+    versions: tuple[TileVersion, ...]
     current: int
     area: Area | None = None
     margin_m: float = 0.0
-    labels: tuple[VersionLabel, ...] = ()
     lights: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.labels and len(self.labels) != len(self.field_ids):
-            raise InvalidInput("tile.versions", "not every version has its label")
+        count = len(self.versions)
         for name, number in {"": self.current, **self.lights}.items():
-            is_there = 1 <= number <= len(self.field_ids)
-            if is_there and self.label(number).light != name:
+            is_there = 1 <= number <= count
+            if is_there and self.version(number).label.light != name:
                 raise InvalidInput("tile.lights", f"version {number} is not of light {name!r}")
             if not is_there and name:
-                raise InvalidInput(
-                    "tile.lights", f"{name!r} is version {number}, of {len(self.field_ids)}"
-                )
-        for field_id in self.field_ids:
-            check_field_id("tile.versions", field_id)
-        if len(self.times) != len(self.field_ids):
-            raise InvalidInput("tile.versions", "not every version has its time")
-        if not 1 <= self.current <= len(self.field_ids):
-            raise InvalidInput(
-                "tile.current", f"{self.current} is outside 1..{len(self.field_ids)}"
-            )
+                raise InvalidInput("tile.lights", f"{name!r} is version {number}, of {count}")
+            if not is_there:
+                raise InvalidInput("tile.current", f"{number} is outside 1..{count}")
 
-    def label(self, number: int) -> VersionLabel:
-        """Return the label of version ``number``."""
-        return self.labels[number - 1] if self.labels else OWN_LIGHT
+    @property
+    def field_ids(self) -> tuple[str, ...]:
+        """The fields of all versions."""
+        return tuple(version.field_id for version in self.versions)
+
+    def version(self, number: int) -> TileVersion:
+        """Return the version of that number."""
+        return self.versions[number - 1]
 
     def of_light(self, light: str) -> list[int]:
         """Return the numbers of the versions of a light, ascending; of the tile's own for ''."""
-        numbers = range(1, len(self.field_ids) + 1)
-        return [number for number in numbers if self.label(number).light == light]
+        numbered = enumerate(self.versions, 1)
+        return [number for number, version in numbered if version.label.light == light]
 
-    def with_version(self, field_id: str, time: str, label: VersionLabel) -> TileVersions:
+    def followed_by(self, version: TileVersion) -> TileVersions:
         """Return these and one more version, which is the current one of its light."""
-        number = len(self.field_ids) + 1
-        labels = (*(self.label(n) for n in range(1, number)), label)
-        field_ids, times = (*self.field_ids, field_id), (*self.times, time)
-        return replace(self, field_ids=field_ids, times=times, labels=labels).having(
-            label.light, number
-        )
+        versions = (*self.versions, version)
+        return replace(self, versions=versions).having(version.label.light, len(versions))
 
     def having(self, light: str, number: int | None) -> TileVersions:
         """Return these with another current version of a light; None withdraws the light."""
@@ -110,16 +112,17 @@ class TileVersions:
         return replace(self, lights=others if number is None else {**others, light: number})
 
     def tile(self, name: str) -> Tile:
-        """Return the current versions."""
-        field_id = self.field_ids[self.current - 1]
-        lights = tuple(self._light(name, n) for name, n in sorted(self.lights.items()))
-        return Tile(name, field_id, self.current, self.area, self.margin_m, lights)
+        """Return the tile with what is current."""
+        own = self.version(self.current)
+        lights = tuple(self._light(light, n) for light, n in sorted(self.lights.items()))
+        return Tile(name, own.field_id, self.current, self.area, self.margin_m, lights)
 
     def _light(self, name: str, number: int) -> TileLight:
-        label = self.label(number)
+        version = self.version(number)
+        label = version.label
         return TileLight(
             name,
-            self.field_ids[number - 1],
+            version.field_id,
             number,
             label.base_field_id,
             label.passes,
@@ -172,24 +175,23 @@ def write_publication(folder: Path, publication: Publication) -> None:
 def _versions(stored: Mapping[str, Any]) -> TileVersions:
     area = stored["area"]
     return TileVersions(
-        field_ids=tuple(str(version["field_id"]) for version in stored["versions"]),
-        times=tuple(str(version["published"]) for version in stored["versions"]),
+        versions=tuple(_version(version) for version in stored["versions"]),
         current=int(stored["current"]),
         area=None if area is None else Area(_corner(area["low_m"]), _corner(area["high_m"])),
         margin_m=float(stored["margin_m"]),
-        labels=tuple(_label(version) for version in stored["versions"]),
         lights={str(name): int(number) for name, number in stored.get("lights", {}).items()},
     )
 
 
-def _label(version: Mapping[str, Any]) -> VersionLabel:
-    hour = version.get("time_of_day_h")
-    return VersionLabel(
-        str(version.get("light", "")),
-        str(version.get("base_field_id", "")),
-        int(version.get("passes", 0)),
+def _version(stored: Mapping[str, Any]) -> TileVersion:
+    hour = stored.get("time_of_day_h")
+    label = VersionLabel(
+        str(stored.get("light", "")),
+        str(stored.get("base_field_id", "")),
+        int(stored.get("passes", 0)),
         None if hour is None else float(hour),
     )
+    return TileVersion(str(stored["field_id"]), str(stored["published"]), label)
 
 
 def _corner(stored: Any) -> tuple[float, float]:
@@ -198,21 +200,17 @@ def _corner(stored: Any) -> tuple[float, float]:
 
 
 def _stored(versions: TileVersions) -> dict[str, Any]:
-    area = versions.area
     return {
-        "area": None if area is None else {"low_m": area.low_m, "high_m": area.high_m},
+        "area": None if versions.area is None else asdict(versions.area),
         "margin_m": versions.margin_m,
         "current": versions.current,
         "lights": dict(sorted(versions.lights.items())),
-        "versions": [
-            {"field_id": field_id, "published": versions.times[index], **_stored_label(label)}
-            for index, field_id in enumerate(versions.field_ids)
-            for label in (versions.label(index + 1),)
-        ],
+        "versions": [_stored_version(version) for version in versions.versions],
     }
 
 
-def _stored_label(label: VersionLabel) -> dict[str, Any]:
-    """Return what differs from the tile's own light, so that plain manifests stay short."""
-    plain = asdict(OWN_LIGHT)
-    return {name: value for name, value in asdict(label).items() if value != plain[name]}
+def _stored_version(version: TileVersion) -> dict[str, Any]:
+    """Return a version with what differs from the tile's own light, so that plain files stay so."""
+    own, label = asdict(OWN_LIGHT), asdict(version.label)
+    more = {name: value for name, value in label.items() if value != own[name]}
+    return {"field_id": version.field_id, "published": version.published, **more}

@@ -129,11 +129,12 @@ class FieldList:
                 low, high = tile.area.low_m, tile.area.high_m
                 ground = f"{low[0]:g}, {low[1]:g} to {high[0]:g}, {high[1]:g} m"
             print(f"{name}: {ground}, margin {tile.margin_m:g} m")
-            for number, field_id in enumerate(tile.field_ids, 1):
+            for number, version in enumerate(tile.versions, 1):
                 is_current = number == tile.current or number in tile.lights.values()
-                mark, light = "*" if is_current else " ", _light_text(tile.label(number))
-                state = f"  {states[field_id]}" if states.get(field_id) else ""
-                print(f"{mark} {number:3}  {tile.times[number - 1]}  {field_id}{light}{state}")
+                mark, light = "*" if is_current else " ", _light_text(version.label)
+                field_id, state = version.field_id, states.get(version.field_id)
+                state = f"  {state}" if state else ""
+                print(f"{mark} {number:3}  {version.published}  {field_id}{light}{state}")
 
 
 @dataclass(frozen=True)
@@ -174,8 +175,8 @@ def _states(folder: Path, publication: Publication) -> dict[str, str]:
 
     states: dict[str, str] = {}
     for tile in publication.tiles.values():
-        bases = (label.base_field_id for label in tile.labels if label.base_field_id)
-        for field_id in dict.fromkeys((*tile.field_ids, *bases)):
+        bases = [version.label.base_field_id for version in tile.versions]
+        for field_id in dict.fromkeys(filter(None, (*tile.field_ids, *bases))):
             path = folder / f"{field_id}.rff"
             if not path.exists():
                 states[field_id] = GONE

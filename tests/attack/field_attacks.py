@@ -19,7 +19,7 @@ from rfcore.field.archive import Archive, decode_archive, encode_archive
 from rfcore.field.store import encode_field
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.tile_manifest import Publication, TileVersions, write_publication
+from rfcore.wire.tile_manifest import Publication, TileVersion, TileVersions, write_publication
 
 SHIPPED = Path(__file__).parents[2] / "samples/fields/street.rff"
 
@@ -63,7 +63,7 @@ async def malformed_publications(target: Target) -> None:
         data = malformed_archive(number)
         field_id = hashlib.sha256(data).hexdigest()
         (folder / f"{field_id}.rff").write_bytes(data)
-        versions = TileVersions((field_id,), ("2026-11-01T12:00:00+00:00",), 1)
+        versions = TileVersions((TileVersion(field_id, "2026-11-01T12:00:00+00:00"),), 1)
         write_publication(folder, Publication({"west": versions}))
         await asyncio.sleep(0.5)
 

@@ -32,8 +32,8 @@ from rfcore.wire.messages import (
 )
 from rfcore.wire.tile_manifest import (
     MANIFEST,
-    OWN_LIGHT,
     Publication,
+    TileVersion,
     TileVersions,
     VersionLabel,
     write_publication,
@@ -116,10 +116,9 @@ def put_files() -> None:
         put("spz", name, data)
         put("spz", f"{name}-plain", gzip.decompress(data))
     label = VersionLabel("dusk", FIELD_ID, 2, 19.5)
-    labels = (OWN_LIGHT, label)
-    times = ("2026-11-01T12:00:00+00:00",) * 2
-    area = Area((-1.0, -2.0), (3.0, 4.0))
-    versions = TileVersions((FIELD_ID, "cd" * 32), times, 1, area, 2.0, labels, {"dusk": 2})
+    published, area = "2026-11-01T12:00:00+00:00", Area((-1.0, -2.0), (3.0, 4.0))
+    each = (TileVersion(FIELD_ID, published), TileVersion("cd" * 32, published, label))
+    versions = TileVersions(each, 1, area, 2.0, {"dusk": 2})
     with tempfile.TemporaryDirectory() as folder:
         write_publication(Path(folder), Publication({"west": versions}))
         put("tiles", "west", (Path(folder) / MANIFEST).read_bytes())

@@ -42,8 +42,8 @@ def test_what_changed_for_good_becomes_the_tiles_own_field(
     assert (learnt.light, learnt.replaced_id) == ("", street.noon_id)
     assert learnt.field_id == west.tile("west").field_id != street.noon_id
     assert learnt.saved_percent > 10
-    assert west.label(2).passes == 2
-    assert west.label(2).time_of_day_h is None, "what lasts is of no hour"
+    assert west.version(2).label.passes == 2
+    assert west.version(2).label.time_of_day_h is None, "what lasts is of no hour"
 
 
 @pytest.mark.usefixtures("learnt_before")
