@@ -90,6 +90,7 @@ def looking(at_m: tuple[float, float, float], heading: float) -> Pose:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.sample
 def test_pictures_become_a_field_and_saved_bits(tmp_path: Path) -> None:
     make_pictures(tmp_path / "pictures", 16)
@@ -127,6 +128,7 @@ def free_ports(count: int) -> list[str]:
     return ports
 
 
+@pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.usefixtures("sample_drive")
 def test_a_vehicle_drives_over_a_link_and_the_twin_shows_it(tmp_path: Path) -> None:
