@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
@@ -117,7 +118,18 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
         outcome = _drive_outcome(settings, drive, field_path, field, elsewhere)
         sequences[drive] = measure_drive(outcome)
         pictures[drive] = list(outcome.pictures)
-    result = _result(settings, field, sequences)
+    content = {
+        "format": "rfedge-demo-1",
+        "settings": settings,
+        "field": {
+            "id": field.field_id,
+            "kind": field.metadata.kind,
+            "gaussians": field.primitives,
+            "held_out_psnr_db": field.metadata.held_out_psnr_db,
+        },
+        "sequences": sequences,
+    }
+    result = make_result("demo", provenance(), content)
     # Camera on the left, the server's reconstruction on the right.
     pairs = (np.hstack([p.camera, p.reconstruction]) for drive in pictures.values() for p in drive)
     write_mp4(settings.out / "reconstructed.mp4", pairs, settings.rate_hz)
@@ -141,7 +153,8 @@ def _drive_outcome(
     work.mkdir(parents=True)
     drive_path = settings.sample / f"transforms_drive_{drive}.json"
     _run_processes(settings, drive_path, field_path, field.field_id, work)
-    agent_rows = _json_lines(work / "agent.jsonl")
+    lines = (work / "agent.jsonl").read_text().splitlines()
+    agent_rows = [json.loads(line) for line in lines]
     parts = [read_recorded_part(file) for file in recordings_under(work / RECORDED)]
     recorded = {(r.epoch, r.sequence): (part, r) for part in parts for r in part.pictures}
     dataset = read_dataset(drive_path)
@@ -196,14 +209,6 @@ def _address(row: Mapping[str, Any]) -> FrameAddress:
     return (row["epoch"], row["sequence"])
 
 
-def _json_lines(path: Path) -> list[dict[str, Any]]:
-    """Return a report's lines that are whole; raise ``RfedgeError`` if there is none."""
-    if not path.exists():
-        raise RfedgeError(f"{path} was not written: the processes reported nothing")
-    *whole, _ = path.read_text().split("\n")
-    return [json.loads(line) for line in whole]
-
-
 def _pictures(
     dataset: Dataset,
     field: RadianceField,
@@ -233,29 +238,9 @@ def _elsewhere(sample: Path, field: RadianceField) -> Rgb:
     """Return a render of the field at the training view that is farthest from the drive."""
     train = read_dataset(sample / "transforms_train.json")
     drive = read_dataset(sample / f"transforms_drive_{DRIVES[0]}.json")
-    start = drive.pictures[0].camera.world_from_cam.translation_m
+    start_m = drive.pictures[0].camera.world_from_cam.translation_m
     farthest = max(
         train.pictures,
-        key=lambda view: sum(
-            (a - b) ** 2
-            for a, b in zip(view.camera.world_from_cam.translation_m, start, strict=True)
-        ),
+        key=lambda view: math.dist(view.camera.world_from_cam.translation_m, start_m),
     )
     return _rendered(field, farthest.camera)
-
-
-def _result(
-    settings: DemoSettings, field: RadianceField, sequences: Mapping[str, DriveFigures]
-) -> dict[str, Any]:
-    content = {
-        "format": "rfedge-demo-1",
-        "settings": settings,
-        "field": {
-            "id": field.field_id,
-            "kind": field.metadata.kind,
-            "gaussians": field.primitives,
-            "held_out_psnr_db": field.metadata.held_out_psnr_db,
-        },
-        "sequences": sequences,
-    }
-    return make_result("demo", provenance(), content)
