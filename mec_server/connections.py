@@ -54,7 +54,7 @@ UNEXPLAINED_BYTES = 4 << 20
 """Bytes that a connection may have sent without their becoming messages: more than waits to be read
 from a rig of 18 cameras, two large frames each, while the server is too busy to read."""
 UNCALLED_BYTES = 256 << 10
-"""The same for a connection on which no call was seen yet: a Hello has some kB."""
+"""The same for a connection on which no call was seen yet: a Hello takes some kB."""
 UNEXPLAINED_BYTES_PER_S = 64 << 10
 """Rate at which such bytes are forgiven: acknowledgements, pings, headers, consumers' requests."""
 OVERHEAD = 1.1
@@ -87,10 +87,10 @@ class Connection:
 
 
 def source_of(address: str) -> str:
-    """Return what connections from ``address`` are counted under: an IPv4 address, or the /64 of
-    an IPv6 address.
+    """Return the source under which connections from ``address`` are counted: the IPv4 address, or
+    the /64 of the IPv6 address.
 
-    Raises ``ValueError`` for what is no address.
+    Raises ``ValueError`` if ``address`` is no address.
     """
     ip = ipaddress.ip_address(address.partition("%")[0])
     if ip.version == 4:
@@ -130,13 +130,13 @@ class ByteAccount:
 
 @dataclass
 class PeerNotes:
-    """What calls have reported about a connection since the last sweep."""
+    """Reports of calls about one connection since the last sweep."""
 
     explained_bytes: float = 0.0
     identity: str = ""
     is_exempt: bool = False
     offences: dict[Limit, bool] = field(default_factory=dict)
-    """And whether a sweep has told of it."""
+    """Limits that the connection exceeded, and whether a sweep has reported each."""
 
 
 class Connections:
@@ -161,9 +161,9 @@ class Connections:
         self._lock = Lock()
 
     def listen(self, port: int) -> None:
-        """Have the connections to ``port`` looked after from now on; silent ones are the kernel's.
+        """Start watching the connections to ``port``; the kernel closes silent ones by itself.
 
-        Before it is called there is nothing to sweep.
+        Before this call there is nothing to sweep.
         """
         self._port = port
         keep_silent_out(port)
@@ -215,7 +215,7 @@ class Connections:
 
     def sweep(self, now: float) -> list[ClosedConnections]:
         """Close connections that are too many or cost too much, and bar their addresses; return
-        what was closed.
+        those closed.
 
         Not for the event loop: it takes about 10 us a connection.
         """

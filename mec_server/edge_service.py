@@ -57,7 +57,7 @@ class EdgeService:
         return len(self._streams)
 
     def drain(self) -> None:
-        """Let every stream finish what it has taken, then end it."""
+        """Let every stream finish the frames that it has accepted, then end it."""
         for stream in self._streams:
             stream.drain()
 
@@ -67,7 +67,7 @@ class EdgeService:
             stream.fields_changed(current_field_ids)
 
     def notice_takers(self) -> list[Stream]:
-        """Return the streams of vehicles that want to be told of the street."""
+        """Return the streams of vehicles that asked for notices."""
         return [stream for stream in self._streams if stream.takes_notices]
 
     def end_stalled(self, now: float) -> None:

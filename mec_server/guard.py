@@ -36,7 +36,8 @@ Handler = Any  # grpc's RpcMethodHandler: of any of four kinds
 
 @dataclass(eq=False)
 class OpenCall:
-    """A call that is open, and why it is to end; ``proxy``: whom it came through."""
+    """An open call, and the reason to end it, if there is one. ``proxy``: the proxy it came
+    through."""
 
     identity: PeerIdentity
     proxy: PeerIdentity | None
@@ -87,7 +88,7 @@ class Guard(grpc.aio.ServerInterceptor):
     def _client(self, context: Context) -> tuple[PeerIdentity | None, Context]:
         """Return the proxy of a call, if there is one, and the context that names its client.
 
-        Raises ``AccessDenied`` for a proxy whose certificate is not good, or that names nobody.
+        Raises ``AccessDenied`` for a proxy whose certificate is not valid or names nobody.
         """
         proxy = self._proxies.proxy_of(context)
         if proxy is None:

@@ -64,9 +64,9 @@ ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 
 
 class Learner:
-    """Keeps the learning process running: ``start``, then ``look`` now and then, then ``close``.
+    """Keeps the learning process running: call ``start``, then ``look`` regularly, then ``close``.
 
-    ``show`` is given what was learnt, by tile, with each look; ``now_s`` is a monotonic clock.
+    ``show`` is given the history of each tile with each look; ``now_s`` is a monotonic clock.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Learner:
         log.info("learning", recordings=str(self._job.recordings), pid=self._process.pid)
 
     def look(self) -> None:
-        """Start the process again if it has ended, and show what was learnt; raise ``OSError``."""
+        """Restart the process if it has ended, and show the tiles' histories; raise ``OSError``."""
         process = self._process
         is_over = process is not None and process.poll() is not None
         if process is not None and is_over and self._now_s() - self._started_s >= RESTART_S:

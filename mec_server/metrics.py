@@ -68,7 +68,7 @@ class BackgroundTask(StrEnum):
     NATS_FIELDS = "nats_fields"
     """Exchanges fields with other servers over NATS; begins anew."""
     LEARNING = "learning"
-    """Keeps the learning process running and reads what it learnt; goes on with its next look."""
+    """Keeps the learning process running and reads its results; continues at the next look."""
 
 
 class OpeningResult(StrEnum):
@@ -278,7 +278,7 @@ class ServerMetrics:
         self.answer.observe(times.total_ns / 1e9)
 
     def observe_ledger(self, entry: EntryControl, limiter: LogLimiter) -> None:
-        """Have each scrape read what is promised, held and spent."""
+        """Have each scrape read the ledger: worker time promised, resources held and spent."""
         ledger, promises = entry.ledger, entry.promises
         self._promised.set_function(lambda: promises.promised_share)
         self._reduced.set_function(lambda: promises.reduced)
@@ -311,7 +311,7 @@ class ServerMetrics:
             self._passes.labels(tile.name).set(sum(light.passes for light in tile.lights))
 
     def show_learnt(self, histories: Mapping[str, TileHistory]) -> None:
-        """Publish what was learnt of each tile."""
+        """Publish the histories of learning, by tile."""
         for name, history in histories.items():
             self._withdrawals[name] = partial(float, history.withdrawals)
             if history.learnt:
@@ -320,7 +320,7 @@ class ServerMetrics:
                 self._saved.labels(name).set(0 if last.withdrawn else last.saved_percent / 100)
 
     def count_limited(self, limit: str, count: int = 1) -> None:
-        """Count what was refused or ended because of ``limit``."""
+        """Count refusals and endings because of ``limit``."""
         self.limited.labels(limit).inc(count)
 
     def count_picture(self, field_id: str, payload_bytes: int) -> None:

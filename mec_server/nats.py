@@ -83,9 +83,9 @@ class _Client(Client):
 
 
 class NatsLink:
-    """Connects to one of ``servers`` as ``name``, again and again.
+    """Connects to one of ``servers`` as ``name``, and reconnects.
 
-    ``told`` is called with whether it is connected and with a detail, when that changes.
+    ``told`` is called with whether it is connected, and a detail, at each change.
     """
 
     def __init__(

@@ -72,7 +72,7 @@ STATUS_OF: tuple[tuple[type[RfedgeError], grpc.StatusCode], ...] = (
 
 
 def status_of(error: RfedgeError) -> grpc.StatusCode:
-    """Return the status that tells a peer about ``error``."""
+    """Return the gRPC status for ``error``."""
     for kind, status in STATUS_OF:
         if isinstance(error, kind):
             return status

@@ -1,15 +1,15 @@
-"""Calls through a proxy: whose certificate one is of when the proxy has ended the TLS connection.
+"""Calls through a proxy that ends the TLS connection: who the client is.
 
 A proxy places streams by their metadata, so it must decrypt them. It shows the server a certificate
-of its own (``spiffe://rfedge/proxy/NAME``), and says of each call in the header
-``x-forwarded-client-cert`` (XFCC) which certificate its client showed to it. The server believes
-the header of the proxies that it was told of (``--proxy-identity NAME``); everybody else may write
-into it what they like. A proxy's call without the header, such as a health check, is its own.
+of its own (``spiffe://rfedge/proxy/NAME``), and names in the header ``x-forwarded-client-cert``
+(XFCC) the certificate that the client of each call showed to it. The server believes this header
+only from the proxies that it was given (``--proxy-identity NAME``); anybody else may write into it
+what they like. A proxy's call without the header, such as a health check, is its own.
 
 The format is Envoy's: ``KEY=VALUE;KEY=VALUE``, values quoted where they must be, a comma between
 the certificates of several proxies in a row. One is expected, as ``SANITIZE_SET`` leaves it, with
-``URI`` and ``Cert``: with the certificate the client is checked like one that came by itself, for
-its end and against the list of those revoked.
+``URI`` and ``Cert``: the certificate lets the server check the client as if it had connected
+itself, for expiry and against the revocation list.
 <https://www.envoyproxy.io/docs/envoy/latest/configuration/http/http_conn_man/headers>
 """
 
@@ -77,9 +77,9 @@ class ForwardedContext:
 
 
 def forwarded_auth_context(header: str) -> AuthContext:
-    """Return whom an XFCC header names, in the form of gRPC's ``auth_context``.
+    """Return the client that an XFCC header names, in the form of gRPC's ``auth_context``.
 
-    Raises ``AccessDenied`` unless that is one vehicle, consumer or operator, and its certificate.
+    Raises ``AccessDenied`` unless it names one vehicle, consumer or operator, with a certificate.
     """
     pairs = _pairs(header)
     uris = [value for key, value in pairs if key == "uri"]

@@ -82,7 +82,7 @@ class Decoder(Protocol):
         """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
 
     def close(self) -> None:
-        """Give back what it holds."""
+        """Release the decoder process and the field."""
 
 
 OpenCameras = Callable[[OpenJob, FieldSource, Tools], dict[str, Decoder]]

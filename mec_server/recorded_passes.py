@@ -47,15 +47,15 @@ FITS_LEVELS = 6.0
 SAME_LIGHT = 0.25
 """Two passes are in one light if the logarithms of their colours' gains differ by no more."""
 LOOKED_AT = 5
-"""Frames of a pass by which its light is told."""
+"""Number of frames by which the light of a pass is estimated."""
 
 
 @dataclass(frozen=True)
 class RecordedPass:
-    """A recording that is over: its name, its pass, and what tells its light.
+    """A finished recording: its name, its pass, and its light.
 
     ``gains``: logarithms of the colours' gains over the tile's own field; ``nearest_light``: None
-    if it fits none.
+    if no light fits.
     """
 
     name: str

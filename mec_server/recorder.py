@@ -143,7 +143,7 @@ class RecordingQuota:
         del self._bytes[part], self._tiles[part]
 
     def add(self, part: Path, written_bytes: int) -> None:
-        """Count what was written to a part."""
+        """Count the bytes written to a part."""
         self._bytes[part] += written_bytes
 
 
@@ -204,7 +204,7 @@ class Recorder:
         return SessionRecording(session_id, hello, origins, self._put)
 
     def close(self) -> None:
-        """Write what is queued, then stop."""
+        """Write the queued pictures, then stop."""
         self._queue.put(None)
         self._thread.join()
 

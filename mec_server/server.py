@@ -420,7 +420,7 @@ class EdgeServer:
         await self._nats.bring_missing()
 
     async def take_up_fields(self) -> None:
-        """Serve what is published now, and tell the vehicles if it is something else."""
+        """Serve the present publication, and announce it to the vehicles if it changed."""
         before = self._published.tiles
         if await asyncio.to_thread(self._published.refresh):
             tiles = self._published.tiles

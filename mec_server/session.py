@@ -274,7 +274,7 @@ class ServerSession:
         self._restart_deadline(now)
 
     def grant(self, rate_hz: float) -> None:
-        """Let each camera send so many pictures per second; 0: as many as credits allow."""
+        """Limit each camera to this many pictures per second; 0: as many as credits allow."""
         self._rate_hz = rate_hz
         if self.state is SessionState.OPEN:
             self._say(self._welcome())

@@ -1,8 +1,8 @@
-"""The history of what was learnt of each tile, kept beside the recordings.
+"""The history of learning of each tile, kept beside the recordings.
 
-RECORDINGS/.learning/tiles.json holds a ``TileHistory`` by the tile's name: what was learnt, tried
-and withdrawn. The learning process writes it (``mec_server.tile_learning``); the server reads it
-for its metrics.
+RECORDINGS/.learning/tiles.json holds a ``TileHistory`` by the tile's name: lights learnt, tried and
+withdrawn. The learning process writes it (``mec_server.tile_learning``); the server reads it for
+its metrics.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class TileHistory:
     """CPU time spent on learning in the last hour: when, and how many seconds."""
 
     def newest(self, tile: str) -> Iterator[LearntLight]:
-        """Yield what was learnt last of each light of ``tile``, whose history this is."""
+        """Yield the last result of each light of ``tile``, whose history this is."""
         for one in {one.light: one for one in self.learnt}.values():
             saved_ratio = one.saved_percent / 100
             yield LearntLight(
@@ -70,7 +70,7 @@ class TileHistory:
 
 
 def read_histories(recordings: Path) -> dict[str, TileHistory]:
-    """Return what was learnt, by tile; raise ``InvalidInput`` for a file that is damaged."""
+    """Return the histories, by tile; raise ``InvalidInput`` for a damaged file."""
     path = recordings / LEARNING / HISTORIES
     if not path.exists():
         return {}
@@ -91,6 +91,6 @@ def _history(stored: Mapping[str, Any]) -> TileHistory:
 
 
 def write_histories(recordings: Path, histories: Mapping[str, TileHistory]) -> None:
-    """Write what was learnt, by tile, in one piece."""
+    """Write the histories, by tile, atomically."""
     stored = {name: asdict(one) for name, one in histories.items()}
     write_whole(recordings / LEARNING / HISTORIES, json.dumps(stored))

@@ -88,7 +88,7 @@ class LearningJob:
     max_bytes: int = 10**9
     max_age_s: float = 86_400.0
     quiet_s: float = 20.0
-    """A pass is over when nothing was added to its recording for so long."""
+    """A pass is over when nothing was added to its recording for this long."""
     max_field_bytes: int = 2 << 30
 
     def settings(self) -> UpdateSettings:
@@ -196,7 +196,7 @@ class TileLearner:
     # --- what was published
 
     def withdraw_worse(self) -> None:
-        """Withdraw each learnt and current field that increases somebody's bits, and count it."""
+        """Withdraw each current learnt field that increases the bits of a vehicle, and count it."""
         for one in self._current():
             self._check(one)
 
@@ -209,7 +209,7 @@ class TileLearner:
                     self._withdraw(one, harm.vehicle, harm.percent)
 
     def _current(self) -> Iterator[Learnt]:
-        """Yield what was learnt and is published."""
+        """Yield the learnt lights that are published."""
         versions = self._versions()
         for light in ("", *versions.lights):
             number = versions.lights[light] if light else versions.current
@@ -392,7 +392,8 @@ class TileLearner:
         )
 
     def _check_room(self, wanted_bytes: int) -> None:
-        """Remove the oldest learnt archives that nobody is sent to any more until one more fits."""
+        """Remove the oldest learnt archives that no vehicle is sent any more, until one more
+        fits."""
         tile = self._versions().tile(self.name)
         paths = {
             one.field_id: self._job.fields / f"{one.field_id}.rff"

@@ -156,7 +156,7 @@ LOOK_EVERY_S = 0.05
 """Period at which the main thread checks for a signal and for the end of the watcher."""
 
 FINISH_S = 5.0
-"""Longest time that a watcher may take to complete its files after it was told to stop."""
+"""Longest time to complete the files after a stop."""
 
 UNFINISHED = "rfedge watch: ended before its files were complete\n"
 

@@ -144,7 +144,7 @@ class Page:
         self._driver = driver
 
     def await_shown(self, cameras: int) -> None:
-        """Wait until the splats are drawn, and stay so, and so many cameras are on the wall."""
+        """Wait until the splats stay drawn and ``cameras`` cameras are on the wall."""
         end_s = time.monotonic() + LOADED_S
         drawing_s = time.monotonic()
         while (now_s := time.monotonic()) - drawing_s < SETTLED_S:
@@ -155,7 +155,7 @@ class Page:
             time.sleep(POLL_S)
 
     def watch(self, seconds: float) -> Seen:
-        """Return what is seen in the next ``seconds``."""
+        """Return the page's figures over the next ``seconds``."""
         take = "const t = window.twin; const a = t.state.ages; t.state.ages = [];"
         self._driver.execute_script(take)
         time.sleep(seconds)
@@ -205,7 +205,7 @@ WARM_UP_S = 5.0
 
 
 class TwinBed:
-    """Field, drive and folder of what is measured here."""
+    """Field, drive and folder of a measurement."""
 
     def __init__(self, field: Path, drive: Path, work: Path, hz: float, seconds: float) -> None:
         self.field, self.drive, self.work = field, drive, work

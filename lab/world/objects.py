@@ -69,8 +69,8 @@ __all__ = [
 ]
 
 LEAST_PX, REACH_M, MATCH_M = 400, 30.0, 2.0
-"""A vehicle of so many pixels within reach is to be found; an object further from its outline is
-another thing."""
+"""Least size and greatest distance of a vehicle that must be found; distance from its outline
+beyond which an object is a false one."""
 CAMERA = ("eval", "front")
 NOISE_SIGMA, NOISE_SEED = 3.0, 3
 SAME_TIME_S = 1e-6
@@ -162,7 +162,7 @@ def _found_by(picture: AnnotatedPicture, objects: Sequence[FollowedObject]) -> d
 
 
 def object_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
-    """Return what is found of vehicles, with and without noise, and what where there are none."""
+    """Return the rows of vehicles found, with and without noise, and of false objects."""
     vehicles, empty = Drive.given(asked.vehicles), Drive.given(asked.empty)
     with_vehicles = AnnotatedDrive.of(vehicles, field, SceneTruth(vehicles.scene))
     nothing = AnnotatedDrive.of(empty, field, None)
@@ -193,8 +193,8 @@ def empty_minute(drive: AnnotatedDrive) -> WorldRow:
 
 
 def followed(drive: AnnotatedDrive, sigma: float, seed: int = NOISE_SEED) -> FoundVehicles:
-    """Return how what is followed through a drive, with noise of ``sigma`` levels added, compares
-    with the truth."""
+    """Follow the objects of a drive with noise of ``sigma`` levels added; compare with the
+    truth."""
     tracker, found = ObjectTracker(), FoundVehicles()
     rng = np.random.default_rng(seed)
     sent = [noisy(picture.rgb, sigma, rng) for picture in drive.pictures]
@@ -299,7 +299,7 @@ def _at_dusk(scene: Scene) -> Scene:
 
 
 def dusk_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
-    """Return what is found at dusk, in the light that the field has learnt."""
+    """Return the rows of vehicles found at dusk, in the light that the field has learnt."""
     paths = [given.partition(",")[0] for given in (asked.empty, asked.vehicles)]
     scenes, console = dusk_scenes(paths[0], paths[1]), Console(soft_wrap=True)
     teacher = _rendered(scenes.teacher, asked.work, console)

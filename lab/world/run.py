@@ -54,14 +54,14 @@ LIVE_AGE_S = 0.1
 """Age of the picture that a view is composed of."""
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 LEAST_TOLD_S = 1e-3
-"""To this a notice's ``unseen_s`` is rounded."""
+"""Resolution of a notice's ``unseen_s``."""
 CHANGED_LEVELS, LEAST_CHANGED = 16, 0.002
 """Pixels of which the truth differs by more from that of the empty street, and the share of a view
 from which on they count."""
 
 
 def run_world(asked: EvalWorld) -> None:
-    """Measure what is asked for, write the rows, print them."""
+    """Measure the requested rows, write them, print them."""
     field, console = load_field(asked.field), Console()
     asked.work.mkdir(parents=True, exist_ok=True)
     cases: dict[str, Callable[[], list[WorldRow]]] = {
@@ -272,8 +272,11 @@ def _timed(seconds: list[float]) -> Iterator[None]:
 
 
 def notice_rows(asked: EvalWorld) -> list[WorldRow]:
-    """Return how old what a vehicle is told is when it arrives: since the capture of the picture
-    that shows it. Both vehicles are prerecorded: the cores are the server's."""
+    """Return the rows of the age of notices at arrival, since the capture of the picture that shows
+    the object.
+
+    Both vehicles are prerecorded: the cores are the server's.
+    """
     field = load_field(asked.field)
     drives = [
         PrerecordedDrive.read(
@@ -299,7 +302,7 @@ def notice_rows(asked: EvalWorld) -> list[WorldRow]:
 async def _ages_told_ms(
     asked: EvalWorld, address: str, seeing: PrerecordedDrive, told: PrerecordedDrive
 ) -> list[float]:
-    """Drive both for a while; return the age of each object told, in ms.
+    """Drive both for a while; return the age of each notified object, in ms.
 
     Raises ``RfedgeError`` if the server does not take one of them.
     """
@@ -341,8 +344,8 @@ def age_on_arrival_s(arrived_s: float, unseen_s: float, captured_s: Sequence[flo
 
 
 def ingest_rows(asked: EvalWorld) -> list[WorldRow]:
-    """Return the p99 of ingest alone, and beside what is done while a processor is idle: live views
-    that are asked for again and again, and learning."""
+    """Return the rows of the p99 of ingest: alone, and beside work that runs on idle processors
+    (live views requested again and again, and learning)."""
     drive = Drive.given(asked.vehicles)
     path = Path(asked.vehicles.split(",")[1])
     bed = TwinBed(asked.field, path, asked.work, asked.notices_hz, asked.seconds / 3)

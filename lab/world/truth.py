@@ -34,9 +34,9 @@ __all__ = ["Drive", "Footprint", "SceneTruth", "VisibleVehicle", "aside"]
 
 F64 = NDArray[np.float64]
 SAMPLED = 4
-"""Every fourth pixel of vehicles is looked at."""
+"""Stride of the sampled pixels of vehicles."""
 GAP_M = 0.3
-"""Pixels of a vehicle lie within so much of its outline on the ground."""
+"""Greatest distance of a vehicle's pixels from its outline on the ground."""
 
 
 @dataclass(frozen=True)

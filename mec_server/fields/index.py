@@ -60,7 +60,8 @@ class FieldIndex:
         return self._ids
 
     def path(self, field_id: str) -> Path:
-        """Return the file of a field; raise ``UnknownField`` naming it and what is here."""
+        """Return the file of a field; raise ``UnknownField``, which names the fields that are
+        here."""
         path = self._paths.get(field_id)
         if path is None:
             here = ", ".join(self._ids) or "nothing"
@@ -144,7 +145,7 @@ class PublishedFields:
         self._names: Mapping[str, str] = {}
 
     def start(self) -> None:
-        """Take what is published; raise ``FieldFormatError`` or ``UnknownField``."""
+        """Read the publication; raise ``FieldFormatError`` or ``UnknownField``."""
         self._seen = self._stamp()
         self._take(read_publication(self._folder))
 

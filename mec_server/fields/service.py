@@ -146,9 +146,10 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
 
 
 async def _readable(field_id: str, lines: PeerLog, read: Callable[..., R], *arguments: object) -> R:
-    """Return what ``read`` returns on a thread; raise ``UnknownField`` where the disk refuses.
+    """Call ``read`` on a thread and return its result; raise ``UnknownField`` where the disk
+    refuses.
 
-    What the peer is told names the field and no path of this machine; ``lines`` has it.
+    The peer's message names the field and no path of this machine; the path goes to ``lines``.
     """
     try:
         return await asyncio.to_thread(read, *arguments)

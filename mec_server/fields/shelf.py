@@ -71,12 +71,12 @@ class FieldShelf:
             return self._open.get(field_id)
 
     def draw_once(self) -> None:
-        """Draw a picture of the open field of most splats, for nobody.
+        """Warm up: draw one picture of the largest open field of splats.
 
-        What drawing needs is made by the first picture of a thread, and by the first ones that are
-        drawn at the same time: for the street that ships, 10 MB of memory and 40 ms of a processor
-        whose host takes free memory back, beside the 40 ms that the picture takes. A hash grid
-        needs next to nothing.
+        The first picture of each thread, and the first pictures drawn at the same time, set up
+        memory that later ones reuse: for the street that ships, 10 MB and 40 ms of a processor
+        whose host reclaims free memory, beside the 40 ms that the picture takes. A hash grid needs
+        next to nothing.
         """
         with self._lock:
             fields = [field for field in self._open.values() if field.metadata.kind == SPLATS]

@@ -27,9 +27,8 @@ __all__ = [
 ]
 
 CAMERA_SILENT_S = 3.0
-"""A stream that sent nothing for so long may be taken over by another agent: its own keepalive
-(2 s and 1 s) has noticed by then that the connection is dead. Cameras slower than 1 Hz get two of
-their periods more."""
+"""Silence after which another agent may take a camera over: by then the stream's own keepalive (2 s
+and 1 s) has noticed a dead connection. Cameras slower than 1 Hz get two of their periods more."""
 
 
 class CameraSender(Protocol):

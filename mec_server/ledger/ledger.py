@@ -25,17 +25,16 @@ __all__ = [
 
 MAX_LOST_DECODERS = 3
 BARRED_S = 60.0
-"""An identity whose packets cost so many decoder processes within this time is kept out for as
+"""An identity whose packets crash this many decoder processes within this time is refused for as
 long."""
 
 FREE_FAILURES = 2
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
-"""Openings that come to nothing one after another, without a picture in between: two are answered
-at once, for one may be a mistake; after each further one the identity waits, twice as long each
-time."""
+"""Openings in a row that come to nothing, without a picture in between: two are answered at once,
+for one may be a mistake; after each further one the identity waits, twice as long each time."""
 
 HELD_RETRY_S = 1.0
-"""Delay before trying again for what others hold: nobody knows when they give it back."""
+"""Delay before trying again for a resource that others hold: when they return it is unknown."""
 
 BURST_S = 1.0
 LONGER_BURST_S = {Resource.WORKER_SECONDS: 5.0, Resource.REJECTED_SECONDS: 2.0}
@@ -58,7 +57,7 @@ class TokenBucket:
         self._filled_s = now
 
     def set_rate(self, rate: float, now: float, burst: float | None = None) -> None:
-        """Refill at ``rate`` from now on; what is left stays, even above the new burst."""
+        """Refill at ``rate`` from now on; keep the present level, even above the new burst."""
         self._fill(now)
         self._rate = rate
         self._burst = rate * BURST_S if burst is None else burst
@@ -233,10 +232,8 @@ class Ledger:
     def charge(
         self, identity: str, resource: Resource, amount: float, now: float, *, lent: bool = False
     ) -> None:
-        """Charge ``identity`` with what it has used already.
-
-        ``lent``: nobody else wanted it, so it makes no debt, to be paid when somebody does.
-        """
+        """Charge ``identity`` for use that has happened. ``lent``: nobody else wanted it, so it
+        leaves no debt to be paid when somebody does."""
         self._account(identity, now).spent[resource].charge(amount, now, lent=lent)
         self._buckets[resource].charge(amount, now)
         self._spent[resource] += amount

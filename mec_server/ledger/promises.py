@@ -1,18 +1,18 @@
 """Worker time that is promised to vehicles, as pictures per second of each of their cameras.
 
-Sans-IO: ``now`` is an argument. What is shared out is the workers' time. What a frame takes of it
-is measured while the server works: for each stream, and per pixel of each field for new ones. So
-when other processes use the machine, or a field is slow to render, frames take longer and lower
+Sans-IO: ``now`` is an argument. The quantity shared out is the workers' time. The time that a frame
+takes is measured while the server works: for each stream, and per pixel of each field for new ones.
+So when other processes use the machine, or a field is slow to render, frames take longer and lower
 rates are granted.
 
-Worker time is given out in three rounds, each in the order in which streams came: what a stream
-uses, within its identity's share; what it asked for, within that share; and what is left. So a
-promise that is not used decays to what is, one identity holds more than its share only as long as
-nobody else wants it, and a newcomer finds the rest at once. Frames that were rejected use nothing
-(their time is limited apart, ``IdentityBudget.rejected_workers``), and a stream of an identity that
-is doubtful needs nothing until it does use something: neither junk nor streams that are opened
-again and again keep newcomers out. One for whom less than the lowest rate is left is refused and
-told when to try again; no admitted stream is ended, nor told a rate below the lowest.
+Worker time is given out in three rounds, each in the order in which streams came: the time a stream
+uses, within its identity's share; the time it asked for, within that share; and the rest. So an
+unused promise decays to the use made of it, one identity holds more than its share only while
+nobody else wants it, and a newcomer finds the rest at once. Rejected frames count as no use (their
+time has a limit of its own, ``IdentityBudget.rejected_workers``), and a stream of a doubtful
+identity needs nothing until it uses something: neither junk nor streams that are opened again and
+again keep newcomers out. A vehicle for which less than the lowest rate is left is refused, with the
+time to try again; no admitted stream is ended or given a rate below the lowest.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ FRAME_WEIGHT = 1 / 32
 """Weight of a frame in the running means; at 10 Hz they follow within three seconds."""
 
 MAX_RELATIVE_COST = 4.0
-"""A frame that took longer than so many usual ones counts as that many: one may be an accident."""
+"""Limit of the cost of one frame, relative to the mean: a slow frame may be an accident."""
 
 REVIEW_S = 1.0
 MIN_RELATIVE_CHANGE = 0.1
-"""Rates are reallocated once a second, and a vehicle is told of changes by more than a tenth."""
+"""Period of reallocation, and the smallest relative change of a rate that a vehicle is sent."""
 
 DECAY_S = 8.0
 """Time constant with which the rate that a stream is taken to use follows the one it does use."""
 
 HEADROOM = 1.25
-"""A stream is taken to need so much more than it uses, so that it can come back."""
+"""A stream's need relative to its use: room to come back to its full rate."""
 
 
 @dataclass
@@ -154,7 +154,7 @@ class Promises:
         return _offered_hz(stream)
 
     def leave(self, session_id: str) -> None:
-        """Forget a stream that ended; what it had is shared out at the next reallocation."""
+        """Remove a stream that ended; its share is given out at the next reallocation."""
         self._streams.pop(session_id, None)
         self.is_crowded = len(self.identities()) > 1
 
@@ -272,6 +272,7 @@ class Promises:
 
 
 def _offered_hz(stream: Promise) -> float:
-    """Return the rate to tell the vehicle: 0, "no limit", if it stated none and gets all."""
+    """Return the rate to send to the vehicle: 0 ("no limit") if it stated none and is granted
+    all."""
     full = stream.granted_hz >= stream.requested_hz
     return 0.0 if full and not stream.states_rate else stream.granted_hz

@@ -315,7 +315,7 @@ class PlaceRecords:
         return revision
 
     async def _read(self, key: str) -> tuple[VehicleLocation, int] | None:
-        """Return what is written and its revision; ``None`` for nothing that can be read."""
+        """Return the entry and its revision; ``None`` if there is none that can be read."""
         try:
             entry = await self._bucket.get(key)
             return VehicleLocation.decode(entry.value or b""), entry.revision or 0

@@ -166,7 +166,7 @@ class _FieldThread:
         self._grounds: OrderedDict[str, FieldGround] = OrderedDict()
 
     def ground(self, field: RadianceField) -> FieldGround:
-        """Return the ground of ``field``; what was drawn of it is kept."""
+        """Return the ground of ``field``, with the renders that it has cached."""
         ground = self._grounds.pop(field.field_id, None) or FieldGround(field.render)
         self._grounds[field.field_id] = ground
         if len(self._grounds) > MOST_GROUNDS:

@@ -347,7 +347,7 @@ class Twin:
         self._mailboxes.remove(mailbox)
 
     def ignore_expected(self) -> None:
-        """Call nobody any more when decoding begins."""
+        """Stop calling ``expect`` when decoding begins."""
         self.expect = _nobody_expects
 
     def ages_s(self, now: float) -> Mapping[str, float]:

@@ -32,7 +32,7 @@ ROUNDS = 24
 """Most rounds. At the right pose or nearly so 4 to 12 suffice, a wrong one takes all; after 12 a
 few of those were not half-way yet."""
 CONVERGED = 1e-3
-"""Metres and radians; 1e-4 takes half as long again at the right pose and tells nothing more."""
+"""Metres and radians; 1e-4 takes half as long again at the right pose for the same answer."""
 SHARE = 0.75
 BETTER = 0.95
 """A fit must lower the median residual to this share, or the picture fits nowhere, as one that a

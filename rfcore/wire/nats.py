@@ -55,11 +55,11 @@ FIELDS_BUCKET: Final = "rfedge-fields"
 PLACE_HEADER: Final = "Rfedge-Place"
 
 EXPIRES_S: Final = 6.0
-"""A session of which nothing was heard for so long is over."""
+"""A session that was silent for this long is over."""
 WANTED_EVERY_S: Final = 0.5
-"""How often a consumer says which encoding it wants."""
+"""Period at which a consumer repeats the encoding it wants."""
 WANTED_S: Final = 3.0
-"""For how long a server publishes an encoding after it was wanted."""
+"""Time for which a server publishes an encoding after the last request."""
 
 MOST_SERVERS: Final = 16
 LONGEST_LOGIN_BYTES: Final = 4096
@@ -148,9 +148,9 @@ class NatsServers:
 
 @dataclass(frozen=True)
 class VehicleLocation:
-    """Where a vehicle is: session ``session_id`` of ``server``, in ``tile`` (may be empty: none is
-    published) against ``field_id``. ``opened_time_ns``: when the vehicle said Hello, Unix
-    time of the server; ``epoch``: the last that was seen of it."""
+    """A vehicle's session ``session_id`` on ``server``, in ``tile`` (empty: none is published)
+    against ``field_id``. ``opened_time_ns``: when the vehicle said Hello, Unix time of the server;
+    ``epoch``: the last one seen of it."""
 
     vehicle_id: str
     server: str
@@ -195,7 +195,8 @@ class VehicleLocation:
 
 
 class VehicleLocations:
-    """Where every vehicle is, of what several servers say. ``now``: seconds, monotonic."""
+    """Locations of all vehicles, from the reports of several servers. ``now``: seconds,
+    monotonic."""
 
     def __init__(self) -> None:
         self._heard: dict[str, dict[tuple[str, str], tuple[VehicleLocation, float]]] = {}

@@ -162,7 +162,7 @@ class TwinClient:
 
 
 class AsyncTwinClient:
-    """The same for an event loop; connected inside of ``async with``.
+    """``TwinClient`` for an event loop; connected inside of ``async with``.
 
     Waits for a server that is not there yet. Raises as ``TwinClient`` does.
     """

@@ -70,7 +70,7 @@ MAX_AGE_S: Final = 10.0
 NO_AGE: Final = 65535
 """Value of ``RenderResponse.age_ms`` where no live picture confirms the pixel."""
 MOST_PLACE_M: Final = 1e8
-"""Of the world: more than the equator from end to end."""
+"""Limit of world coordinates: more than the equator's length."""
 
 Vec3 = tuple[float, float, float]
 

@@ -90,7 +90,7 @@ class Watch:
     encoding: Literal["none", "i420", "jpeg", "png"] | None = None
     """How pictures travel; default: i420 (exact) for a video, jpeg for a folder, else none."""
     pictures: int | None = None
-    """Stop after so many pictures."""
+    """Stop after this many pictures."""
     tls_cert: Annotated[Path | None, PEM] = None
     """Certificate of this consumer (PEM), for a server or a NATS that wants one."""
     tls_key: Annotated[Path | None, PEM] = None
@@ -210,7 +210,7 @@ class CertsShow:
     folder: Annotated[Path, Positional, FOLDER] = Path("out/certs")
     """The folder of `rfedge certs init`."""
     within_days: int = 0
-    """Also call those an error that run out within so many days."""
+    """Also fail if one expires within this many days."""
 
     def run(self) -> None:
         """Read, print, judge."""

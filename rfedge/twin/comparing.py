@@ -68,12 +68,12 @@ def _finite(psnr_db: float) -> float | None:
 log = structlog.get_logger()
 
 UNWATCHED_EVERY_S = 1.0
-"""Period at which the picture of a camera is compared that nobody looks at in full."""
+"""Period at which the picture of a camera that nobody views in full is compared."""
 IDLE_S = 0.05
 
 
 class Comparer:
-    """Compares the newest pictures with renders, first those of cameras that browsers look at."""
+    """Compares the newest pictures with renders, first those of cameras viewed in full."""
 
     def __init__(
         self,
@@ -88,11 +88,11 @@ class Comparer:
         self._done: dict[CameraKey, tuple[int, float]] = {}
 
     def select(self, key: CameraKey) -> None:
-        """Note that one more browser looks at ``key``."""
+        """Note that one more browser views ``key`` in full."""
         self._watched[key] += 1
 
     def release(self, key: CameraKey) -> None:
-        """Note that one browser looks no more."""
+        """Note that one browser left the full view of ``key``."""
         self._watched -= Counter({key: 1})
 
     async def run(self) -> None:

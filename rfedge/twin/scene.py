@@ -217,8 +217,8 @@ class TwinScene:
     def show_objects(
         self, field_id: str, objects: Sequence[StreetObject], now_s: float, problem: str = ""
     ) -> None:
-        """Show what stands on a field's ground that the field does not have, in place of what was
-        shown there; ``problem``: why nothing is known of it."""
+        """Show objects on a field's ground that the field lacks, in place of the previous ones;
+        ``problem``: why none are known."""
         header = {
             "kind": "objects",
             "field": field_id,

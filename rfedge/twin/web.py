@@ -58,7 +58,7 @@ EXIT_SEEN_S: Final = 1.0
 STALLED_S: Final = 10.0
 """A browser that takes nothing for this long is disconnected; it connects again by itself."""
 HEALTH: Final = "/healthy"
-"""Answers without a token, to whoever restarts a service that does not; tells nothing else."""
+"""Answers without a token, for supervisors that restart a service; discloses nothing else."""
 COOKIE: Final = "rfedge-twin"
 SHORTEST_TOKEN: Final = 16
 POLICY: Final = (
@@ -91,7 +91,7 @@ class WebSettings:
 
 @dataclass(frozen=True)
 class Select:
-    """The browser's user looks at this camera in full; ``None``: at none."""
+    """The browser's user views this camera in full; ``None``: none."""
 
     camera: CameraKey | None
 
@@ -264,7 +264,7 @@ class TwinWeb:
                 return
 
     async def _listen(self, socket: web.WebSocketResponse, user: _User) -> None:
-        """Follow what the browser's user looks at, until it leaves."""
+        """Follow the browser's selections until it leaves."""
         try:
             async for message in socket:
                 if message.type is WSMsgType.TEXT:
@@ -360,7 +360,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class TwinRun:
-    """Settings of ``rfedge twin``; ``source`` is made for the scene that it shows things in."""
+    """Settings of ``rfedge twin``; ``source`` makes the source for a scene."""
 
     web: WebSettings
     source: Callable[[TwinScene], Source]
