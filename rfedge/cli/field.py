@@ -47,8 +47,8 @@ class FieldImport:
     .spz."""
 
     splats: Annotated[Path, Positional, SPLATS]
-    """The file; properties of a .ply are found by name, text and binary alike. Axes stay the
-    file's: a .spz that its makers' own tool made from a .ply is turned half round x against it."""
+    """The file; properties of a .ply are found by name, text and binary alike. Axes stay those of
+    the file: a .spz that its makers' own tool made from a .ply is turned half round x."""
     name: Annotated[str, arg(metavar="NAME")]
     """What to call the field; every command that takes a field knows it by this name."""
     out: Annotated[Path | None, RFF] = None
@@ -58,14 +58,14 @@ class FieldImport:
     transform: Path | None = None
     """nerfstudio's dataparser_transforms.json, to bring the field back to its world."""
     tile_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """East, north and up of the tile, m, taken off in float64."""
+    """East, north and up of the tile's origin, m, subtracted in float64."""
     antialiased: bool = False
     """The field was trained with antialiased rasterization (gsplat, Mip-Splatting), and the file's
     SplatRenderMode comment does not say so."""
     raw: bool = False
     """Keep every float32 as it is instead of compressing to about a tenth."""
     unconfined: bool = False
-    """Read the file in this process and not in a sandbox: for files of your own."""
+    """Read the file in this process instead of a sandbox; only for files of your own."""
     threads: int = 2
     """Threads of the renderer that predicts the time of a frame."""
 
@@ -164,7 +164,7 @@ class FieldExport:
 
 @dataclass(frozen=True)
 class FieldInfo:
-    """Print what is known about a field, and what a frame of each level of detail takes here."""
+    """Print what is known about a field, and the time of a frame at each level of detail here."""
 
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name."""

@@ -26,8 +26,8 @@ class FieldPublish:
     """Publish a field as the next version of a tile; running servers take it up."""
 
     field: Annotated[Path, Positional, FIELD]
-    """The archive (.rff), or the field's name; or a folder of tiles that `rfedge train` trained,
-    each of which is published under its name, for its ground."""
+    """The archive (.rff), or the field's name; or a folder of tiles that `rfedge train` trained:
+    each is published under its own name, for its own ground."""
     folder: Annotated[Path, FOLDER]
     """The server's folder of fields (mec-server --fields)."""
     tile: Annotated[str, arg(metavar="NAME")] = "street"
@@ -35,16 +35,17 @@ class FieldPublish:
     area: Annotated[
         tuple[float, float, float, float] | None, arg(metavar="WEST SOUTH EAST NORTH")
     ] = None
-    """West, south, east, north side of the ground it is for, m; as before, at first everywhere."""
+    """West, south, east and north side of the ground it is for, m; default: as before, at first
+    everywhere."""
     margin_m: float | None = None
-    """How far beyond its ground the field serves where a neighbour does not; at first 0."""
+    """Distance beyond its ground to which the field serves where no neighbour does; at first 0."""
     light: str = ""
-    """Publish it as the tile under another light of this name, beside the tile's own field; a
-    vehicle takes what is nearest to its frames. A colour layer (field update) is published so."""
+    """Publish it beside the tile's own field, as the tile under another light of this name; a
+    vehicle takes what is nearest to its frames. Publish a colour layer (field update) like this."""
     time_of_day_h: float | None = None
-    """Hours of the day, UTC, at which that light is."""
+    """Hour of the day, UTC, of that light."""
     passes: int = 0
-    """How many passes it was learnt from."""
+    """Number of passes it was learnt from."""
 
     def run(self) -> None:
         """Publish, and say what is current."""
@@ -96,8 +97,8 @@ class FieldList:
     folder: Annotated[Path, Positional, FOLDER]
     """The server's folder of fields (mec-server --fields)."""
     verify: bool = False
-    """Read every archive and compare its SHA-256 with the id: of a backup, say. What is
-    damaged is an error, and what is current and gone; earlier versions may be gone."""
+    """Read every archive and compare its SHA-256 with its id, as for a backup. A damaged archive is
+    an error, and so is a missing one that is current; earlier versions may be missing."""
 
     def run(self) -> None:
         """Print a line a version; the current one has a star. Verified: ``InvalidData`` if bad."""
@@ -146,7 +147,7 @@ class FieldRollback:
     tile: Annotated[str, arg(metavar="NAME")] = "street"
     """The tile to take back."""
     to: int | None = None
-    """The version that was good; the one before the current without it."""
+    """The version to make current; default: the one before the current."""
     light: str = ""
     """Take back a light of the tile; one without an earlier version is withdrawn."""
 
@@ -158,7 +159,7 @@ class FieldRollback:
 
 
 def _current(tile: Tile, light: str) -> str:
-    """Say what is current, of a light or of the tile itself."""
+    """Return a line that says what is current, for a light or for the tile itself."""
     if not light:
         return f"{tile.name} is version {tile.version}, field {tile.field_id}"
     for one in tile.lights:
@@ -168,7 +169,7 @@ def _current(tile: Tile, light: str) -> str:
 
 
 def _states(folder: Path, publication: Publication) -> dict[str, str]:
-    """Return of each archive that is named what is wrong with it, or nothing."""
+    """Return the defect of each archive that is named, empty for none."""
     from hashlib import sha256
 
     from rfcore.field.archive import read_file

@@ -35,17 +35,17 @@ class FieldUpdate:
     recordings: Annotated[tuple[Path, ...], arg(name="from", metavar="DATASET...")]
     """Passes under one light, a dataset each (docs/how-to/data.md)."""
     out: Annotated[Path, RFF]
-    """The archive to write; a layer or a delta belongs into the folder of its base."""
+    """The archive to write; keep a layer or a delta in the folder of its base."""
     learn_as: Annotated[Literal["all", "delta", "colours"], arg(name="as")] = "all"
-    """all: another field, every parameter fine-tuned. delta: the same as its difference to this
-    field, of a third of the bytes. colours: a colour layer on this field, of a fiftieth, for
-    another light on what is there."""
+    """all: a new field with every parameter fine-tuned. delta: the same, stored as the difference
+    to this field in a third of the bytes. colours: a layer of colours on this field, in a fiftieth
+    of the bytes, for the same street under another light."""
     frames: int = 48
-    """Most frames taken of all passes; a quarter of them is held back for the trial."""
+    """Most frames to take of all passes; a quarter of them is held back for the trial."""
     iterations: int = 600
-    """Of fine-tuning (with --as all or delta)."""
+    """Iterations of fine-tuning (with --as all or delta)."""
     min_identities: int = 2
-    """Refuse to learn from fewer passes: what one alone shows may be what drove by."""
+    """Refuse to learn from fewer passes: what a single one shows may be passing traffic."""
     threads: int = 1
     """Threads of the renderer."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
@@ -137,12 +137,12 @@ def _learn_as_job(update: FieldUpdate, tell: Tell) -> None:
 
 @dataclass(frozen=True)
 class FieldDisagree:
-    """Show where a field and what was seen of the street disagree."""
+    """Show where a field and recorded pictures of the street disagree."""
 
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name."""
     recordings: Annotated[tuple[Path, ...], arg(name="from", metavar="DATASET...")]
-    """Passes, a dataset each."""
+    """Passes, one dataset each."""
     out: Annotated[Path, PNG] = Path("out/field-disagree.png")
     """Four frames: camera, render, and in red where they differ under the render's own light."""
     threads: int = 1

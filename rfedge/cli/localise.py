@@ -1,4 +1,4 @@
-"""``rfedge localise``: find a drive's poses in a field, from wrong ones."""
+"""``rfedge localise``: find a drive's poses in a field, starting from wrong ones."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ class Localise:
     field: Annotated[Path, FIELD]
     """The field: an archive (.rff), or a name."""
     start_error: Annotated[str, arg(metavar="METRESm:DEGREESdeg")] = "2m:3deg"
-    """How far from the dataset's pose each search starts."""
+    """Distance and angle from the dataset's pose at which each search starts."""
     tries: int | None = None
-    """Searches, over the pictures in turn; default: one a picture."""
+    """Number of searches, over the pictures in turn; default: one for each picture."""
     seed: int = 1
     """Seed of the starts."""
     out: Annotated[Path | None, arg(metavar="FILE.tum")] = None
-    """Write the pose found of each picture, a TUM line each; what was lost is a comment."""
+    """Write the pose found of each picture as a TUM line; a lost picture is a comment."""
     pose_feed: Annotated[Path | None, arg(metavar="FILE")] = None
     """Start from a recorded feed of NMEA or JSON lines (docs/how-to/localise.md) instead, one
     search a picture; its times are the drive's. Deviations are those the feed states."""
     feed_offset_s: float = 0.0
-    """Add to the feed's times to get the drive's, seconds."""
+    """Seconds to add to the feed's times to get the drive's."""
     camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The camera seen from the feed's antenna: metres forward, left, up."""
     rate: float = 10.0
