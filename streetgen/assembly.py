@@ -21,8 +21,6 @@ from streetgen.geometry.tree import trees
 from streetgen.geometry.world import World
 from streetgen.scene_file import Scene
 
-__all__ = ["apply_effects", "plain_world", "world_of"]
-
 
 def world_of(scene: Scene) -> World:
     """Return everything that is rendered of a scene."""

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from rfcore.errors import DatasetError
 from rfcore.image import read_rgb
 
-__all__ = ["Label", "class_picture_of", "read_classes"]
-
 PICTURES, CLASSES = "images", "classes"
 
 

@@ -18,8 +18,6 @@ from tyro.conf import Positional, arg, subcommand
 from rfedge.arguments import FOLDER, JSON, SIZE, parse_size
 from rfedge.program import CONFIG, run_program
 
-__all__ = ["Build", "Plan", "Sheet", "main", "parse"]
-
 SCENE = arg(metavar="SCENE")
 
 

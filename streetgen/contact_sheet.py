@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.files import write_whole
 
-__all__ = ["contact_sheet", "write_contact_sheet"]
-
 Bgr = NDArray[np.uint8]
 CAPTION_PX = 22
 GAP_PX = 4

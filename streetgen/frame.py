@@ -11,8 +11,6 @@ from rfcore.camera import Camera
 from rfcore.image import Rgb
 from rfcore.lens import LensCamera
 
-__all__ = ["F32", "LinearFrame", "display_rgb", "sampled"]
-
 F32 = NDArray[np.float32]
 
 

@@ -29,15 +29,6 @@ from streetgen.geometry.layout import Geometry
 from streetgen.geometry.world import World
 from streetgen.scene_file import DriveSettings, RigSettings, Scene
 
-__all__ = [
-    "EffectCost",
-    "Planner",
-    "ScenePlan",
-    "plain_frame",
-    "small_render_ms",
-    "write_rows",
-]
-
 REPETITIONS = 5
 FrameMs = Callable[[World], float]
 """A measure of the processor time that a frame of a world takes to render, ms."""

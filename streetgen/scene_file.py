@@ -26,19 +26,6 @@ from rfcore.tables import Range, Table
 from streetgen.effects import EFFECTS, EffectKind, load_effect
 from streetgen.geometry.layout import Geometry
 
-__all__ = [
-    "DriveSettings",
-    "EvaluationSettings",
-    "LocalisationNoise",
-    "OneOf",
-    "RigSettings",
-    "Scene",
-    "TomlFile",
-    "TrainingSettings",
-    "load_scene",
-    "read_record",
-]
-
 T = TypeVar("T")
 HEADER = re.compile(r"\s*\[+\s*([\w.\-\"]+)\s*\]+")
 KEY = re.compile(r"\s*([\w\-\"]+)\s*=")

@@ -31,9 +31,6 @@ from streetgen.trajectory import (
     rig_pose,
 )
 
-__all__ = ["Selection", "Shot", "Split", "shots_of", "thinned_indices"]
-
-
 ENDS_M = 14.0
 """Distance that cars keep from the ends of the facades."""
 STRIDE = 7

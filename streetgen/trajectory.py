@@ -20,19 +20,6 @@ from streetgen.geometry.layout import LANE_M
 from streetgen.geometry.mesh import F64
 from streetgen.scene_file import DriveSettings, LocalisationNoise
 
-__all__ = [
-    "CameraMotion",
-    "drive_motion",
-    "drive_pose",
-    "looking",
-    "measured_pose",
-    "mounted",
-    "on_lane",
-    "rig_motion",
-    "rig_pose",
-]
-
-
 EYE_UP_M = 1.62
 """The drive's camera is behind the windscreen."""
 SWAY_M, SWAY_PERIOD_S = 0.2, 7.3

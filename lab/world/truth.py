@@ -20,8 +20,9 @@ from rfcore.extras import needs
 from rfcore.image import Rgb
 from rfcore.views import PosedPicture
 from streetgen.assembly import world_of
+from streetgen.classes import Label
 from streetgen.frame import LinearFrame, display_rgb
-from streetgen.geometry.mesh import Label, Mesh
+from streetgen.geometry.mesh import Mesh
 from streetgen.geometry.world import World
 from streetgen.render.backend import chosen_backend
 from streetgen.render.renderer import PathTracer, Sampling

@@ -37,9 +37,6 @@ from streetgen.scene_file import Scene
 from streetgen.shots import Shot, Split, shots_of, thinned_indices
 from streetgen.trajectory import measured_pose, mounted
 
-__all__ = ["ORIGIN_NAME", "claim_folder", "list_dataset", "origin_of"]
-
-
 TIMED = (Split.DRIVE, Split.RIG)
 """Splits whose pictures were taken one after the other."""
 

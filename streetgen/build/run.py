@@ -34,9 +34,6 @@ from streetgen.render.backend import CUDA, Backend, Variant, chosen_backend
 from streetgen.render.renderer import Sampling
 from streetgen.shots import Selection, Shot
 
-__all__ = ["Settings", "build_scene", "cost_line", "show_progress", "take_all"]
-
-
 _renderer: SceneRenderer | None = None
 
 

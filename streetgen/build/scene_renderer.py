@@ -23,23 +23,13 @@ from rfcore.files import write_whole
 from rfcore.image import Rgb, write_png
 from rfcore.lens import LensCamera
 from streetgen.assembly import apply_effects, world_of
+from streetgen.classes import Label
 from streetgen.frame import LinearFrame, display_rgb
-from streetgen.geometry.mesh import F32, Label
+from streetgen.geometry.mesh import F32
 from streetgen.render.backend import Backend
 from streetgen.render.renderer import PathTracer, Sampling
 from streetgen.scene_file import Scene
 from streetgen.shots import Shot, Split
-
-__all__ = [
-    "POINTS_PER_VIEW",
-    "RenderJob",
-    "SceneRenderer",
-    "ShotFiles",
-    "camera_of_pictures",
-    "depth_mm",
-    "read_depth_m",
-    "seen_points",
-]
 
 FARTHEST_MM = 65535
 PLACES = ("images", "depth", "classes", "points")

@@ -19,8 +19,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["EFFECTS", "Effect", "EffectKind", "load_effect", "rng_of"]
-
 
 class EffectKind(StrEnum):
     """The part of a scene or frame that an effect changes."""

@@ -17,8 +17,6 @@ from rfcore.errors import InvalidInput
 from rfcore.tables import Range
 from streetgen.frame import LinearFrame
 
-__all__ = ["AutoExposure"]
-
 
 @dataclass(frozen=True)
 class AutoExposure:

@@ -16,8 +16,6 @@ from streetgen.geometry.person import BodyPart
 from streetgen.geometry.vehicle import world_from_vehicle
 from streetgen.geometry.world import Mover, StreetPart, World
 
-__all__ = ["Cyclists"]
-
 BESIDE_M = 3.6
 """Distance from the middle of the road, between traffic in the lane and parked vehicles."""
 

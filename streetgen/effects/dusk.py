@@ -11,8 +11,6 @@ from rfcore.tables import Range
 from streetgen.geometry.sky import DUSK, Daylight, sunny_sky
 from streetgen.geometry.world import World
 
-__all__ = ["Dusk"]
-
 
 @dataclass(frozen=True)
 class Dusk:

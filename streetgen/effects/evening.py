@@ -17,8 +17,6 @@ from rfcore.tables import Range
 from streetgen.geometry.sky import DUSK, NOON, Daylight, sunny_sky
 from streetgen.geometry.world import Sky, World
 
-__all__ = ["Evening", "daylight"]
-
 
 @dataclass(frozen=True)
 class Evening:

@@ -11,8 +11,6 @@ import numpy as np
 from rfcore.tables import Range
 from streetgen.frame import LinearFrame
 
-__all__ = ["ExposureDrift"]
-
 
 @dataclass(frozen=True)
 class ExposureDrift:

@@ -17,8 +17,6 @@ from rfcore.lens import LensCamera
 from rfcore.tables import Range
 from streetgen.frame import F32, LinearFrame
 
-__all__ = ["Haze"]
-
 LEAST_UP = 1e-4
 
 

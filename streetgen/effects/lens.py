@@ -19,8 +19,6 @@ from rfcore.lens import BrownLens, LensCamera
 from rfcore.tables import Range
 from streetgen.frame import F32, LinearFrame, sampled
 
-__all__ = ["LensDistortion"]
-
 ZOOMS = np.geomspace(0.8, 3.0, 200)
 
 F64 = NDArray[np.float64]

@@ -10,8 +10,6 @@ import numpy as np
 from rfcore.tables import Range
 from streetgen.frame import LinearFrame
 
-__all__ = ["SensorNoise"]
-
 
 @dataclass(frozen=True)
 class SensorNoise:

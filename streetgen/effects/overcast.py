@@ -11,8 +11,6 @@ from rfcore.tables import Range
 from streetgen.geometry.sky import overcast_sky
 from streetgen.geometry.world import World
 
-__all__ = ["Overcast"]
-
 
 @dataclass(frozen=True)
 class Overcast:

@@ -14,8 +14,6 @@ from streetgen.geometry.vehicle import VehicleLooks, standing, vehicle
 from streetgen.geometry.vehicle_trim import vehicle_materials
 from streetgen.geometry.world import StreetPart, World
 
-__all__ = ["ParkedVehicles"]
-
 GAP_M = 0.5
 ALONG_M, ACROSS_M, TURN_RAD = 0.2, 0.06, 0.015
 """Standard deviations of a vehicle's place and heading from its bay."""

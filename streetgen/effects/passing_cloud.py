@@ -16,8 +16,6 @@ import numpy as np
 from rfcore.tables import Range
 from streetgen.geometry.world import Sky, World
 
-__all__ = ["PassingCloud"]
-
 
 @dataclass(frozen=True)
 class PassingCloud:

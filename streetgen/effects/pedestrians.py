@@ -23,8 +23,6 @@ from streetgen.geometry.person import (
 from streetgen.geometry.vehicle import world_from_vehicle
 from streetgen.geometry.world import Mover, StreetPart, World
 
-__all__ = ["Pedestrians"]
-
 NEAR_M, FAR_M = 1.9, 2.9
 """The part of the pavement that is free to walk on, as distances from the edge of the road."""
 TURN_BACK_M = 2.2

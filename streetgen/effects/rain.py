@@ -10,8 +10,6 @@ import numpy as np
 from rfcore.tables import Range
 from streetgen.frame import F32, LinearFrame
 
-__all__ = ["Rain"]
-
 FALL_MPS = 9.0
 """Terminal velocity of drops of 5 mm (Gunn and Kinzer 1949)."""
 DROP_WIDTH_M = 0.0025

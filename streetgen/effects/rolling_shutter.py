@@ -14,8 +14,6 @@ import numpy as np
 from rfcore.tables import Range
 from streetgen.frame import LinearFrame, sampled
 
-__all__ = ["RollingShutter"]
-
 SKY_M = 1e6
 
 

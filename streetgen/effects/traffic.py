@@ -15,8 +15,6 @@ from streetgen.geometry.vehicle import VehicleLooks, vehicle, world_from_vehicle
 from streetgen.geometry.vehicle_trim import vehicle_materials
 from streetgen.geometry.world import Mover, StreetPart, World
 
-__all__ = ["Traffic"]
-
 
 @dataclass(frozen=True)
 class Traffic:

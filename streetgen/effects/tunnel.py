@@ -11,11 +11,10 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from streetgen.geometry.mesh import Label, Material
+from streetgen.classes import Label
+from streetgen.geometry.mesh import Material
 from streetgen.geometry.solids import Surface, boxes
 from streetgen.geometry.world import StreetPart, World
-
-__all__ = ["Tunnel"]
 
 CONCRETE = Surface("tunnel", Label.BUILDING)
 WALL_M = 0.4

@@ -17,8 +17,6 @@ from streetgen.geometry.grain import fractal
 from streetgen.geometry.mesh import F32, Colour, Material, Texture
 from streetgen.geometry.world import World
 
-__all__ = ["WetRoad"]
-
 GROUND = ("asphalt", "slabs", "kerb", "paint", "iron")
 MAP_PX = 512
 SMOOTHEST, ROUGHEST = 0.04, 0.6

@@ -12,12 +12,11 @@ import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfcore.tables import Range
+from streetgen.classes import Label
 from streetgen.geometry.layout import KERB_M, ROAD_HALF_M, Closure, GroundSpot
-from streetgen.geometry.mesh import Label, Material, Mesh
+from streetgen.geometry.mesh import Material, Mesh
 from streetgen.geometry.solids import Surface, boxes, tube
 from streetgen.geometry.world import StreetPart, World
-
-__all__ = ["Works"]
 
 NEAR_M, FAR_M = 4.1, ROAD_HALF_M - KERB_M
 """The site lies between these distances from the middle of the road, where the parking bays are. In

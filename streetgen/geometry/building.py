@@ -10,15 +10,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from streetgen.classes import Label
 from streetgen.geometry.facade import BuildingStyle, facade, rooms
 from streetgen.geometry.grain import enlarged, fractal, texture, tinted
 from streetgen.geometry.layout import BEYOND_M, Layout, Plot
-from streetgen.geometry.mesh import F32, F64, Colour, Label, Material, Mesh, Texture, placed
+from streetgen.geometry.mesh import F32, F64, Colour, Material, Mesh, Texture, placed
 from streetgen.geometry.solids import Surface, boxes, quads
 from streetgen.geometry.world import StreetPart
-
-__all__ = ["WALL_TILE_M", "bricks", "buildings", "plaster", "roof_tiles", "stone"]
-
 
 WALL_TILE_M = 4.0
 SHAPE = (1024, 1024)

@@ -16,20 +16,6 @@ import numpy as np
 
 from streetgen.geometry.mesh import F32, F64
 
-__all__ = [
-    "CloudLight",
-    "Clouds",
-    "cumulus",
-    "dithered",
-    "margined",
-    "over",
-    "periodic_at",
-    "shifted",
-    "sunwards_depth",
-    "with_sun_free",
-]
-
-
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]], np.float32)
 
 

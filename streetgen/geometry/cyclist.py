@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from streetgen.geometry.mesh import F64, Label, Material, Mesh, joined
+from streetgen.classes import Label
+from streetgen.geometry.mesh import F64, Material, Mesh, joined
 from streetgen.geometry.person import (
     ANKLE,
     FOREARM,
@@ -35,8 +36,6 @@ from streetgen.geometry.person import (
 )
 from streetgen.geometry.solids import Surface, boxes, disc, loft, tube
 from streetgen.geometry.vehicle import revolved
-
-__all__ = ["WHEEL_RADIUS_M", "Cyclist", "cyclist_materials", "cyclist_parts", "riding"]
 
 Point = tuple[float, float]
 """A place in the plane of the bicycle: (x, z), metres."""

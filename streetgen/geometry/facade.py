@@ -11,24 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from streetgen.classes import Label
 from streetgen.geometry.grain import texture
 from streetgen.geometry.layout import Plot
-from streetgen.geometry.mesh import F32, F64, Label, Mesh, Texture
+from streetgen.geometry.mesh import F32, F64, Mesh, Texture
 from streetgen.geometry.solids import Surface, boxes, quads, tube
-
-__all__ = [
-    "ROOMS",
-    "BuildingStyle",
-    "facade",
-    "frames",
-    "panes",
-    "reveals",
-    "room_uv",
-    "rooms",
-    "sills",
-    "upright",
-    "wall_around",
-]
 
 ROOMS = 16
 SIDE_PX = 256

@@ -11,14 +11,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from streetgen.classes import Label
 from streetgen.geometry.layout import PAVEMENT_UP_M, SIDES, GroundSpot, Layout
-from streetgen.geometry.mesh import F32, F64, Label, Material, Mesh, placed
+from streetgen.geometry.mesh import F32, F64, Material, Mesh, placed
 from streetgen.geometry.signage import FACES, NAMES, ROUND, face_uv, name_uv, sign_materials
 from streetgen.geometry.solids import Surface, boxes, disc, quads, tube
 from streetgen.geometry.world import StreetPart
-
-__all__ = ["lamps", "post_of", "railings", "signs", "traffic_light", "wires"]
-
 
 LAMP_POST = Surface("post", Label.POLE)
 SHADE = Surface("shade", Label.POLE)

@@ -11,8 +11,6 @@ import numpy as np
 
 from streetgen.geometry.mesh import F32, Colour, Texture
 
-__all__ = ["enlarged", "fractal", "speckle", "texture", "tinted"]
-
 COARSEST_PX = 4
 MARGIN_CELLS = 2
 

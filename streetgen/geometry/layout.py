@@ -18,25 +18,6 @@ from rfcore.errors import InvalidInput
 from rfcore.tables import Range
 from streetgen.geometry.mesh import F64
 
-__all__ = [
-    "BAY_LENGTH_M",
-    "BEYOND_M",
-    "CROSSING_M",
-    "FACADE_M",
-    "FASCIA_M",
-    "KERB_M",
-    "LANE_M",
-    "PAVEMENT_UP_M",
-    "ROAD_HALF_M",
-    "SIDES",
-    "Closure",
-    "Course",
-    "Geometry",
-    "GroundSpot",
-    "Layout",
-    "Plot",
-]
-
 ROAD_HALF_M = 6.6
 KERB_M = 0.3
 PAVEMENT_UP_M = 0.14

@@ -20,21 +20,6 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 from streetgen.classes import Label
 
-__all__ = [
-    "F32",
-    "F64",
-    "I32",
-    "Colour",
-    "Label",
-    "Material",
-    "Mesh",
-    "Texture",
-    "faceted",
-    "joined",
-    "placed",
-]
-
-
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]

@@ -14,31 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from streetgen.geometry.mesh import F64, Colour, Label, Material, Mesh, joined, placed
+from streetgen.classes import Label
+from streetgen.geometry.mesh import F64, Colour, Material, Mesh, joined, placed
 from streetgen.geometry.solids import Surface, loft
-
-__all__ = [
-    "ANKLE",
-    "FOREARM",
-    "HAND",
-    "HIP",
-    "HIP_APART",
-    "NECK_FOOT",
-    "SHANK",
-    "SHOULDER",
-    "SHOULDER_APART",
-    "SIDES",
-    "THIGH",
-    "UPPER_ARM",
-    "BodyPart",
-    "Person",
-    "body_parts",
-    "hinge",
-    "hung",
-    "person_materials",
-    "stride_m",
-    "walking",
-]
 
 BodyPart = tuple[str, int]
 """A part's name and its side: 1 left, -1 right, 0 in the middle."""

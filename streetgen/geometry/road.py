@@ -8,6 +8,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from streetgen.classes import Label
 from streetgen.geometry.grain import fractal, speckle, texture, tinted
 from streetgen.geometry.layout import (
     BAY_LENGTH_M,
@@ -18,12 +19,9 @@ from streetgen.geometry.layout import (
     SIDES,
     Layout,
 )
-from streetgen.geometry.mesh import F32, F64, Label, Material, Mesh, Texture
+from streetgen.geometry.mesh import F32, F64, Material, Mesh, Texture
 from streetgen.geometry.solids import Surface, boxes, disc, quads
 from streetgen.geometry.world import StreetPart
-
-__all__ = ["ASPHALT_TILE_M", "SLAB_TILE_M", "asphalt", "paint", "road", "slabs"]
-
 
 ASPHALT_TILE_M = 8.0
 SLAB_TILE_M = 4.0

@@ -13,19 +13,6 @@ import numpy as np
 
 from streetgen.geometry.mesh import F32, Material, Texture
 
-__all__ = [
-    "FACES",
-    "NAMES",
-    "ROUND",
-    "Lettered",
-    "atlas",
-    "atlas_uv",
-    "board",
-    "face_uv",
-    "name_uv",
-    "sign_materials",
-]
-
 FONTS = (cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SIMPLEX)
 Grey = tuple[int, int, int]
 

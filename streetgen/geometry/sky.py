@@ -31,25 +31,6 @@ from streetgen.geometry.cloud import (
 from streetgen.geometry.mesh import F32, F64, Colour
 from streetgen.geometry.world import Sky
 
-__all__ = [
-    "DUSK",
-    "HEIGHT",
-    "NOON",
-    "SUN_DIAMETER_DEG",
-    "Daylight",
-    "clear_radiance",
-    "clear_sky",
-    "directions",
-    "horizontal_irradiance",
-    "overcast_sky",
-    "sun_disc_sr",
-    "sun_radiance",
-    "sunny_sky",
-    "towards",
-    "with_ground",
-]
-
-
 GROUND_ALBEDO = 0.15
 
 

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rfcore.errors import InvalidInput
-from streetgen.geometry.mesh import F32, I32, Label, Mesh
-
-__all__ = ["Surface", "boxes", "disc", "loft", "quads", "tube"]
+from streetgen.classes import Label
+from streetgen.geometry.mesh import F32, I32, Mesh
 
 BOX_SIDES = np.array(
     [

@@ -12,14 +12,12 @@ from functools import lru_cache
 
 import numpy as np
 
+from streetgen.classes import Label
 from streetgen.geometry.grain import fractal, speckle, texture, tinted
 from streetgen.geometry.layout import GroundSpot, Layout
-from streetgen.geometry.mesh import F64, Label, Material, Mesh, Texture, joined, placed
+from streetgen.geometry.mesh import F64, Material, Mesh, Texture, joined, placed
 from streetgen.geometry.solids import Surface, boxes, quads, tube
 from streetgen.geometry.world import StreetPart
-
-__all__ = ["KINDS", "TreeSpecies", "grown", "tree_materials", "trees"]
-
 
 SIZE = (256, 256)
 

@@ -11,25 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from streetgen.geometry.mesh import F64, Label, Mesh, joined, placed
+from streetgen.classes import Label
+from streetgen.geometry.mesh import F64, Mesh, joined, placed
 from streetgen.geometry.signage import atlas_uv
 from streetgen.geometry.solids import Surface, boxes, disc, quads, tube
 from streetgen.geometry.vehicle_body import body, surface_of
 from streetgen.geometry.vehicle_shape import BODIES, BodyShape
 from streetgen.geometry.vehicle_trim import LIVERIES, PAINTS, PLATES, number_plate, trim
-
-__all__ = [
-    "BOX_HIGH_M",
-    "BOX_LOW_M",
-    "KINDS",
-    "VehicleLooks",
-    "cargo",
-    "revolved",
-    "standing",
-    "vehicle",
-    "wheel",
-    "world_from_vehicle",
-]
 
 WALL = Surface("livery", Label.VEHICLE)
 EDGE = Surface("car chrome", Label.VEHICLE)

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from streetgen.geometry.mesh import F64, I32, Label, Mesh
+from streetgen.classes import Label
+from streetgen.geometry.mesh import F64, I32, Mesh
 from streetgen.geometry.vehicle_section import (
     END_M,
     FILLET_RINGS,
@@ -21,8 +22,6 @@ from streetgen.geometry.vehicle_section import (
     sill_line,
 )
 from streetgen.geometry.vehicle_shape import BodyShape
-
-__all__ = ["BodySurface", "body", "surface_of"]
 
 COLUMNS = 16
 """Number of columns across nose and tail."""

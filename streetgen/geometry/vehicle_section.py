@@ -14,8 +14,6 @@ import numpy as np
 from streetgen.geometry.mesh import F64
 from streetgen.geometry.vehicle_shape import BodyShape, curve
 
-__all__ = ["END_M", "FILLET_RINGS", "SEAM_M", "Lofted", "Rows", "lofted", "sill_line", "stations"]
-
 END_M = 0.10
 """Radius of the rounded edge between the sides and nose or tail."""
 FILLET_RINGS = 4

@@ -19,8 +19,6 @@ from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from rfcore.errors import InvalidInput
 from streetgen.geometry.mesh import F64
 
-__all__ = ["BODIES", "BodyShape", "Knots", "curve"]
-
 Knots = tuple[tuple[float, float], ...]
 
 

@@ -10,14 +10,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from streetgen.geometry.mesh import F64, Label, Material, Mesh
+from streetgen.classes import Label
+from streetgen.geometry.mesh import F64, Material, Mesh
 from streetgen.geometry.signage import Lettered, atlas, atlas_uv
 from streetgen.geometry.solids import Surface, boxes, disc, quads, tube
 from streetgen.geometry.vehicle_body import BodySurface
 from streetgen.geometry.vehicle_section import FILLET_RINGS, Rows
 from streetgen.geometry.vehicle_shape import BodyShape
-
-__all__ = ["LIVERIES", "PAINTS", "PLATES", "number_plate", "trim", "vehicle_materials"]
 
 PAINTS = {
     "paint white": (0.78, 0.78, 0.76),

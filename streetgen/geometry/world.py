@@ -20,8 +20,6 @@ from rfcore.errors import InvalidInput
 from streetgen.geometry.layout import Layout
 from streetgen.geometry.mesh import F32, F64, Colour, Material, Mesh
 
-__all__ = ["Mover", "Sky", "StreetPart", "World"]
-
 
 @dataclass(frozen=True, eq=False)
 class Sky:

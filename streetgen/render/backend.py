@@ -24,8 +24,6 @@ from typing import Any, Literal
 
 from rfcore.errors import BackendUnavailable
 
-__all__ = ["CUDA", "Backend", "Variant", "chosen_backend", "load_mitsuba"]
-
 Variant = Literal["auto", "cuda", "llvm", "scalar"]
 """Names of the variants; auto is the first of the others that works."""
 

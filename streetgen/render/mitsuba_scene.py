@@ -21,9 +21,6 @@ import numpy as np
 from streetgen.geometry.mesh import F32, F64, I32, Material, Mesh, joined, placed
 from streetgen.geometry.world import Sky, World
 
-__all__ = ["MitsubaScene", "environment", "surface", "with_sun"]
-
-
 ROWS = 512
 """Rows of the environment map: 0.35 degrees a pixel, so that the sun covers a few of them."""
 LEAST_SUN_PX = 1.5

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics
 from rfcore.errors import InvalidInput
-from streetgen.geometry.mesh import F32, F64, Label
+from streetgen.classes import Label
+from streetgen.geometry.mesh import F32, F64
 from streetgen.geometry.world import World
 from streetgen.render.backend import Backend, load_mitsuba
 from streetgen.render.mitsuba_scene import MitsubaScene
-
-__all__ = ["PathTracer", "RenderedFrame", "Sampling", "cast_pixel_rays"]
 
 
 def cast_pixel_rays(

@@ -28,7 +28,7 @@ from rfcore.perception.composition import live_picture
 from rfcore.perception.objects import FollowedObject
 from rfcore.update.passes import FEWEST_FRAMES
 from server.test_objects import CAMERA_M, FIELD, GROUND, STREET, camera_at, car, joined
-from streetgen.geometry.mesh import Label
+from streetgen.classes import Label
 from streetgen.shots import Split, shots_of
 
 SQUARE = Footprint(np.float32([[0, 0], [2, 0], [2, 1], [0, 1]]))

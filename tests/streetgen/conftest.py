@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from streetgen.classes import Label
 from streetgen.geometry.layout import Geometry, Layout
-from streetgen.geometry.mesh import Label, Material
+from streetgen.geometry.mesh import Material
 from streetgen.geometry.solids import Surface, boxes, quads
 from streetgen.geometry.world import Sky, StreetPart, World
 

@@ -31,7 +31,7 @@ from streetgen.effects.lens import LensDistortion
 from streetgen.render.backend import Backend
 from streetgen.render.renderer import RenderedFrame
 from streetgen.scene_file import DriveSettings, LocalisationNoise, Scene, TrainingSettings
-from streetgen.shots import Selection, Shot
+from streetgen.shots import Selection
 
 SCENE = Scene(
     "s",
@@ -240,18 +240,6 @@ def test_the_scalar_variant_is_said_in_one_line(
     monkeypatch.setattr(run, "chosen_backend", lambda _: Backend("scalar_rgb"))
     first = build(tmp_path / "s", splits="drive", frames="0:1").splitlines()[0]
     assert first == "no LLVM that Mitsuba can use (19 is known to work): scalar_rgb, 3-4x slower"
-
-
-def test_workers_are_counted(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match="workers: 0"):
-        Settings(tmp_path, workers=0)
-
-
-def test_a_shot_says_where_it_belongs() -> None:
-    shot: Shot = Selection(SCENE, "train", None, SIZE_PX).shots()[2]
-    files = ShotFiles.of(Path("x"), shot)
-    assert files.picture_name == "train/images/000002.png"
-    assert files.picture == Path("x/train/images/000002.png")
 
 
 def test_a_rig_is_recorded_with_a_file_that_the_agent_reads(tmp_path: Path) -> None:

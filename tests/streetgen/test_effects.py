@@ -4,7 +4,6 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -209,10 +208,3 @@ def test_an_undeclared_effect_costs_nothing(frame: LinearFrame) -> None:
         sys.setprofile(None)
     effects = {name for name in calls if name.startswith("streetgen.effects.")}
     assert effects == {"streetgen.effects.haze"}
-
-
-def test_the_registry_names_modules_that_exist() -> None:
-    for effect in EFFECTS:
-        module = sys.modules.get(load_effect(effect).__module__)
-        assert isinstance(module, ModuleType)
-        assert module.__name__ == f"streetgen.effects.{effect.name}"

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from streetgen.assembly import plain_world
+from streetgen.classes import Label
 from streetgen.effects import EFFECTS, load_effect, rng_of
 from streetgen.frame import LinearFrame
 from streetgen.geometry.layout import Geometry, Layout
-from streetgen.geometry.mesh import Label, Material
+from streetgen.geometry.mesh import Material
 from streetgen.geometry.sky import Daylight, overcast_sky, sunny_sky
 from streetgen.geometry.solids import Surface, boxes
 from streetgen.geometry.world import Sky, StreetPart, World

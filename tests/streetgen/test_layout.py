@@ -7,9 +7,9 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from streetgen import load_scene
+from streetgen.classes import Label
 from streetgen.geometry.furniture import lamps, railings, signs, wires
 from streetgen.geometry.layout import Course, Geometry, Layout
-from streetgen.geometry.mesh import Label
 from streetgen.geometry.road import road
 
 WIDER_M = 2.4

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
+from streetgen.classes import Label
 from streetgen.geometry.cyclist import (
     PEDAL_THICK_M,
     Cyclist,
@@ -13,7 +14,7 @@ from streetgen.geometry.cyclist import (
     cyclist_parts,
     riding,
 )
-from streetgen.geometry.mesh import F64, Label, Mesh, placed
+from streetgen.geometry.mesh import F64, Mesh, placed
 from streetgen.geometry.person import (
     ANKLE,
     FOREARM,

@@ -9,7 +9,7 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from streetgen.geometry.mesh import Label
+from streetgen.classes import Label
 from streetgen.geometry.solids import Surface, boxes
 from streetgen.geometry.world import Mover, Sky, World
 from streetgen.render.backend import PROBE, Backend, chosen_backend

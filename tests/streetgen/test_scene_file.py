@@ -17,26 +17,11 @@ START = 'name = "x"\nfield = "y"\n'
 
 
 @pytest.mark.parametrize("path", READY_MADE, ids=lambda path: path.stem)
-def test_a_ready_made_scene_is_a_scene(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
+def test_a_ready_made_scene_is_a_scene(path: Path) -> None:
     scene = load_scene(path.stem)
     assert scene.name == path.stem
     assert scene == load_scene(str(path))
     assert (ROOT / "streetgen" / "scenes" / f"{scene.field}.toml").is_file()
-
-
-def test_the_published_evaluation_is_144_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
-    scene = load_scene("street-empty")
-    assert scene.evaluation.stations * scene.rig.cameras == 144
-    assert scene.effects == {}
-
-
-def test_what_is_left_out_has_its_default(tmp_path: Path) -> None:
-    (tmp_path / "s.toml").write_text(START + "[drive]\nduration_s = 1\n[effects.noise]\n")
-    scene = load_scene(str(tmp_path / "s.toml"))
-    assert (scene.drive.duration_s, scene.drive.frames) == (1.0, 30)
-    assert list(scene.effects) == ["noise"]
 
 
 def test_effects_run_in_the_registrys_order(tmp_path: Path) -> None:
@@ -105,10 +90,7 @@ def test_each_pass_has_its_own_place_in_the_lane_and_effects(tmp_path: Path) -> 
     assert two.passes == 2
 
 
-def test_five_days_differ_in_light_vehicles_and_a_building_site(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(ROOT)
+def test_five_days_differ_in_light_vehicles_and_a_building_site() -> None:
     days = [load_scene(f"street-days:{n}") for n in range(1, 6)]
     assert len({day.effects["parked"] for day in days}) == 5
     assert len({day.effects.get("evening") for day in days}) == 3
@@ -133,8 +115,7 @@ def test_a_pass_that_is_not_one_is_refused(tmp_path: Path, mark: str, more: str,
         load_scene(f"{path}{mark}")
 
 
-def test_a_name_that_is_no_scene_lists_those_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
+def test_a_name_that_is_no_scene_lists_those_there_are() -> None:
     with pytest.raises(InvalidInput, match=r"'street-moon'.*street-dusk, street-empty"):
         load_scene("street-moon")
 

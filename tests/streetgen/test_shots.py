@@ -2,7 +2,6 @@
 
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -182,10 +181,7 @@ def test_shots_keep_their_names_at_any_size() -> None:
         assert one.camera.world_from_cam == other.camera.world_from_cam
 
 
-def test_the_empty_streets_drive_has_sixteen_frames_at_two_hertz(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(Path(__file__).parents[2])
+def test_the_empty_streets_drive_has_sixteen_frames_at_two_hertz() -> None:
     scene = load_scene("street-empty")
     assert len(thinned_indices(scene, 2.0)) == 16
     x = places(shots_of(scene, Split.DRIVE))[:, 0]

@@ -5,7 +5,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from streetgen.geometry.mesh import Label, Mesh, faceted
+from streetgen.classes import Label
+from streetgen.geometry.mesh import Mesh, faceted
 from streetgen.geometry.solids import Surface, boxes, disc, quads, tube
 
 CLAY = Surface("clay", Label.OBJECT, tile_m=2.0)

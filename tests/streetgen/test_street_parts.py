@@ -6,12 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from streetgen.classes import Label
 from streetgen.geometry.building import bricks, buildings
 from streetgen.geometry.facade import BuildingStyle, facade, wall_around
 from streetgen.geometry.furniture import lamps, railings, wires
 from streetgen.geometry.grain import fractal
 from streetgen.geometry.layout import BAY_LENGTH_M, FACADE_M, FASCIA_M, Geometry, Layout
-from streetgen.geometry.mesh import Label, Mesh, joined
+from streetgen.geometry.mesh import Mesh, joined
 from streetgen.geometry.road import road, slabs
 from streetgen.geometry.solids import Surface
 from streetgen.geometry.world import StreetPart

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from streetgen.classes import Label
 from streetgen.geometry.furniture import post_of, signs, traffic_light
 from streetgen.geometry.layout import PAVEMENT_UP_M, Geometry, Layout
-from streetgen.geometry.mesh import Label, Mesh
+from streetgen.geometry.mesh import Mesh
 from streetgen.geometry.signage import FACES, NAMES, ROUND, face_picture, sign_materials
 from streetgen.geometry.tree import KINDS, grown, trees
 from streetgen.geometry.world import StreetPart

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
-from streetgen.geometry.mesh import Label, Mesh
+from streetgen.classes import Label
+from streetgen.geometry.mesh import Mesh
 from streetgen.geometry.signage import Lettered, atlas, atlas_uv, board
 from streetgen.geometry.vehicle import KINDS, VehicleLooks, standing, vehicle
 from streetgen.geometry.vehicle_body import surface_of

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
+from streetgen.classes import Label
 from streetgen.geometry.layout import Geometry, Layout
-from streetgen.geometry.mesh import Label, Material, Mesh, faceted, joined, placed
+from streetgen.geometry.mesh import Material, Mesh, faceted, joined, placed
 from streetgen.geometry.world import Sky, StreetPart, World
 
 
