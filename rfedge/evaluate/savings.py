@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rfcore.codec.h264.bitstream import split_nals
+from rfcore.codec.h264.bitstream import NAL_IDR, NAL_P, nal_type, parse_slice_start, split_nals
 from rfcore.codec.h264.config import CodecConfig, effort_of_preset
 from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, encode_pictures
-from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_start
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
@@ -107,4 +106,4 @@ def _type_of(nal: bytes) -> str:
     if nal_type(nal) == NAL_IDR:
         return "IDR"
     # Only the slice type is of interest here; it precedes frame_num.
-    return _TYPES[parse_slice_start(nal, log2_max_frame_num=4).slice_type]
+    return _TYPES[parse_slice_start(nal).slice_type]

@@ -5,11 +5,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rfcore.codec.h264.bitstream import join_nals, rbsp_of_nal, split_nals
+from rfcore.codec.h264.bitstream import (
+    NAL_IDR,
+    NAL_P,
+    join_nals,
+    parse_slice_start,
+    rbsp_of_nal,
+    split_nals,
+)
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.ffmpeg import H264Decoder
-from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, parse_pps, parse_slice_start
-from rfcore.codec.h264.pcm_picture import PCM_PPS_ID, PcmPictures, PcmPlace, pcm_pps, without_zeros
+from rfcore.codec.h264.pcm_picture import PcmPictures, PcmPlace, pcm_pps, without_zeros
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
@@ -32,16 +38,16 @@ def test_any_samples_above_zero_come_back_bit_for_bit(
     sets = [header.sps, header.pps, pcm_pps()]
     for index in range(3):
         source = noise(*size_px, index)
-        nal = pcm_picture(source, PcmPlace(4, idr_pic_id=index % 2))
+        nal = pcm_picture(source, PcmPlace(idr_pic_id=index % 2))
         decoded = decoder.decode(join_nals([*(sets if index == 0 else []), nal]))
         assert decoded.digest() == without_zeros(source).digest()
 
 
 def test_the_picture_is_one_idr_slice_without_emulation_bytes(noise: PictureMaker) -> None:
-    nal = pcm_picture(noise(40, 24, 0), PcmPlace(4, idr_pic_id=1))
+    nal = pcm_picture(noise(40, 24, 0), PcmPlace(idr_pic_id=1))
     assert nal[0] & 0x1F == NAL_IDR
     assert len(rbsp_of_nal(nal)) == len(nal) - 1
-    start = parse_slice_start(nal, log2_max_frame_num=4)
+    start = parse_slice_start(nal)
     assert (start.first_mb, start.slice_type, start.pps_id, start.frame_num) == (0, 2, 1, 0)
 
 
@@ -49,12 +55,12 @@ def test_later_pictures_are_not_idr_and_come_back_bit_for_bit(noise: PictureMake
     header = DeltaEncoder(CodecConfig(50, 34)).header
     decoder = H264Decoder((50, 34))
     decoder.decode(
-        join_nals([header.sps, header.pps, pcm_pps(), pcm_picture(noise(50, 34, 0), PcmPlace(4))])
+        join_nals([header.sps, header.pps, pcm_pps(), pcm_picture(noise(50, 34, 0), PcmPlace())])
     )
     for frame_num in (1, 2):
-        nal = pcm_picture(noise(50, 34, frame_num), PcmPlace(4, frame_num))
+        nal = pcm_picture(noise(50, 34, frame_num), PcmPlace(frame_num))
         assert nal[0] & 0x1F == NAL_P
-        assert parse_slice_start(nal, log2_max_frame_num=4).frame_num == frame_num
+        assert parse_slice_start(nal).frame_num == frame_num
         shown = decoder.decode(join_nals([nal]))
         assert shown.digest() == without_zeros(noise(50, 34, frame_num)).digest()
 
@@ -72,37 +78,27 @@ def test_macroblocks_hold_y_cb_cr_row_by_row_and_the_edge_again(noise: PictureMa
             for plane, side in zip(padded, (16, 8, 8), strict=True)
         ]
         rows.append(b"\x0d\x00" + b"".join(block.tobytes() for block in blocks))
-    assert pcm_picture(source, PcmPlace(4)).endswith(b"".join(rows)[2:] + b"\x80")
+    assert pcm_picture(source, PcmPlace()).endswith(b"".join(rows)[2:] + b"\x80")
 
 
 def test_the_next_picture_takes_the_place_of_the_one_before(noise: PictureMaker) -> None:
     pictures = PcmPictures((32, 32))
     sets = join_nals([pcm_pps()])
-    first = pictures.access_unit(noise(32, 32, 0), PcmPlace(4), sets)
+    first = pictures.access_unit(noise(32, 32, 0), PcmPlace(), sets)
     assert bytes(first[: len(sets)]) == sets
-    second = pictures.access_unit(noise(32, 32, 1), PcmPlace(4))
+    second = pictures.access_unit(noise(32, 32, 1), PcmPlace())
     assert np.shares_memory(np.asarray(first), np.asarray(second))
-    assert bytes(second) == join_nals([pcm_picture(noise(32, 32, 1), PcmPlace(4))])
+    assert bytes(second) == join_nals([pcm_picture(noise(32, 32, 1), PcmPlace())])
 
 
 def test_a_picture_of_another_size_is_refused(noise: PictureMaker) -> None:
     with pytest.raises(InvalidInput, match="out"):
-        PcmPictures((32, 32)).access_unit(noise(32, 16, 0), PcmPlace(4))
+        PcmPictures((32, 32)).access_unit(noise(32, 16, 0), PcmPlace())
 
 
 def test_each_macroblock_takes_its_samples_and_two_bytes(flat: PictureMaker) -> None:
-    small, large = (len(pcm_picture(flat(16 * n, 16, 9), PcmPlace(4))) for n in (1, 5))
+    small, large = (len(pcm_picture(flat(16 * n, 16, 9), PcmPlace())) for n in (1, 5))
     assert large - small == 4 * 386
-
-
-def test_its_parameter_set_is_cavlc_under_an_id_of_its_own() -> None:
-    pps = parse_pps(pcm_pps())
-    assert (pps.pps_id, pps.sps_id, pps.cabac, pps.deblocking_control) == (
-        PCM_PPS_ID,
-        0,
-        False,
-        True,
-    )
 
 
 def test_clamping_changes_zeros_only(noise: PictureMaker) -> None:
@@ -118,7 +114,7 @@ def test_a_picture_larger_than_announced_is_refused_before_it_is_decoded(
     header = DeltaEncoder(CodecConfig(320, 256)).header
     decoder = H264Decoder((64, 64))
     unit = join_nals(
-        [header.sps, header.pps, pcm_pps(), pcm_picture(noise(320, 256, 0), PcmPlace(4))]
+        [header.sps, header.pps, pcm_pps(), pcm_picture(noise(320, 256, 0), PcmPlace())]
     )
     with pytest.raises(CodecError, match="decoder"):
         decoder.decode(unit)
@@ -127,7 +123,7 @@ def test_a_picture_larger_than_announced_is_refused_before_it_is_decoded(
 def test_after_a_reset_the_decoder_starts_over(noise: PictureMaker) -> None:
     header = DeltaEncoder(CodecConfig(32, 32)).header
     decoder = H264Decoder((32, 32))
-    picture = pcm_picture(noise(32, 32, 0), PcmPlace(4))
+    picture = pcm_picture(noise(32, 32, 0), PcmPlace())
     with pytest.raises(CodecError):
         decoder.decode(join_nals([picture]))
     decoder.reset()

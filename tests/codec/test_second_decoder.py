@@ -16,7 +16,7 @@ import pytest
 from codec.sent_streams import make_stream
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import REFERENCE_FRAMES, CodecConfig
-from rfcore.codec.h264.header import own_header
+from rfcore.codec.h264.header import stream_header
 from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, SliceCoder
 from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.image import I420
@@ -73,8 +73,7 @@ def record_own_slices(
     """A stream of our own slices, every mode forced at low and high quantisers, filtered or not;
     and how many pictures it has, references included."""
     config = CodecConfig(*size_px)
-    header = own_header(config)
-    coder, splice = SliceCoder(header), SpliceDecoder(header)
+    coder, splice = SliceCoder(config), SpliceDecoder(stream_header(config))
     recording = Recording(splice._decoder)
     monkeypatch.setattr(splice, "_decoder", recording)
     rng = np.random.default_rng(2)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rfcore.codec.h264.config import REFERENCE_FRAMES, CodecConfig
-from rfcore.codec.h264.header import StreamHeader, own_header
+from rfcore.codec.h264.header import StreamHeader, stream_header
 from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, OwnSlice, SliceCoder
 from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.errors import InvalidInput
@@ -36,12 +36,12 @@ ANY = -1
 
 @cache
 def header_of(size: Size) -> StreamHeader:
-    return own_header(CodecConfig(*size))
+    return stream_header(CodecConfig(*size))
 
 
 @cache
 def coder_of(size: Size) -> SliceCoder:
-    return SliceCoder(header_of(size))
+    return SliceCoder(CodecConfig(*size))
 
 
 def macroblocks(size: Size) -> int:

@@ -21,8 +21,7 @@ from typing import Any
 from mec_server.session import OpenJob, ServerSession
 from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.codec.h264.bitstream import split_nals
-from rfcore.codec.h264.parameter_sets import parse_pps, parse_slice_start, parse_sps
+from rfcore.codec.h264.bitstream import parse_slice_start, split_nals
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.state import DecoderState
 from rfcore.dataset.transforms import read_transforms_source
@@ -95,14 +94,11 @@ def _parts(data: bytes) -> Iterator[bytes]:
 
 
 def bitstream(data: bytes) -> None:
-    """NAL units, parameter sets, the start of a slice."""
+    """NAL units, the start of a slice."""
     with suppress(RfedgeError):
         for nal in split_nals(data):
-            for parse in (parse_sps, parse_pps):
-                with suppress(RfedgeError):
-                    parse(nal)
             with suppress(RfedgeError):
-                parse_slice_start(nal, 4)
+                parse_slice_start(nal)
 
 
 @dataclass(frozen=True)

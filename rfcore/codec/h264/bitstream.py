@@ -1,4 +1,6 @@
-"""Bytes and bits of an H.264 stream. Clause numbers are those of ITU-T H.264 (08/2021).
+"""Bits, NAL units and starts of slices of an H.264 stream.
+
+Clause numbers are those of ITU-T H.264 (08/2021).
 
 A NAL unit here is ``bytes`` without its start code: one header byte, then the payload with
 emulation prevention bytes. An RBSP is that payload without them. Everything that reads raises
@@ -9,10 +11,33 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from rfcore.errors import BitstreamError, InvalidInput
 
-__all__ = ["BitReader", "BitWriter", "join_nals", "nal_of_rbsp", "rbsp_of_nal", "split_nals"]
+__all__ = [
+    "LOG2_MAX_FRAME_NUM",
+    "NAL_IDR",
+    "NAL_P",
+    "NAL_PPS",
+    "NAL_REF_IDC",
+    "NAL_SPS",
+    "BitReader",
+    "BitWriter",
+    "SliceStart",
+    "join_nals",
+    "nal_of_rbsp",
+    "nal_type",
+    "parse_slice_start",
+    "rbsp_of_nal",
+    "split_nals",
+]
+
+NAL_P, NAL_IDR, NAL_SPS, NAL_PPS = 1, 5, 7, 8
+NAL_REF_IDC = 3 << 5
+"""nal_ref_idc 3 in the header byte of a NAL unit."""
+LOG2_MAX_FRAME_NUM = 4
+"""Bits of frame_num in the slice headers of all streams here."""
 
 START_CODE = b"\x00\x00\x00\x01"
 _START = re.compile(rb"\x00\x00\x01")
@@ -119,31 +144,43 @@ class BitReader:
         self._left -= width
         return (self._value >> self._left) & ((1 << width) - 1)
 
-    def flag(self) -> bool:
-        """Read one bit."""
-        return self.u(1) == 1
-
     def ue(self) -> int:
         """Read an unsigned Exp-Golomb code (9.1), at most 2**32 - 2."""
         zeros = 0
-        while not self.flag():
+        while not self.u(1):
             zeros += 1
             if zeros > _MAX_EXP_GOLOMB_ZEROS:
                 raise BitstreamError(f"Exp-Golomb code with more than {zeros - 1} leading zeros")
         return (1 << zeros) - 1 + self.u(zeros)
 
-    def se(self) -> int:
-        """Read a signed Exp-Golomb code (9.1.1)."""
-        code = self.ue()
-        return (code + 1) // 2 if code % 2 else -(code // 2)
 
-    def more_rbsp_data(self) -> bool:
-        """Tell whether anything precedes the stop bit (7.2)."""
-        rest = self._value & ((1 << self._left) - 1)
-        return self._left > 0 and rest != 1 << (self._left - 1)
+_MAX_SLICE_START_BYTES = 64
+"""Bytes of a slice that are read: its first fields take fewer."""
 
-    def stop(self) -> None:
-        """Read the stop bit and its zeros; raise if anything else is left (7.3.2.11)."""
-        rest = self._value & ((1 << self._left) - 1)
-        if self._left == 0 or self._left > 8 or rest != 1 << (self._left - 1):
-            raise BitstreamError(f"{self._left} bits left where the RBSP should stop")
+
+@dataclass(frozen=True)
+class SliceStart:
+    """The first fields of a slice header (7.3.3); ``slice_type`` is 0 P, 1 B, 2 I (table 7-6)."""
+
+    first_mb: int
+    slice_type: int
+    pps_id: int
+    frame_num: int
+
+
+def nal_type(nal: bytes) -> int:
+    """Return nal_unit_type (table 7-1); raise for an empty unit or a set forbidden_zero_bit."""
+    if not nal or nal[0] & 0x80:
+        raise BitstreamError("NAL unit is empty or its forbidden_zero_bit is set")
+    return nal[0] & 0x1F
+
+
+def parse_slice_start(nal: bytes) -> SliceStart:
+    """Parse the first four fields of a slice; what follows is left to the decoder."""
+    if nal_type(nal) not in (NAL_P, NAL_IDR):
+        raise BitstreamError(f"NAL unit type {nal_type(nal)} is not a slice")
+    r = BitReader(rbsp_of_nal(nal)[:_MAX_SLICE_START_BYTES])
+    first_mb, slice_type, pps_id = r.ue(), r.ue(), r.ue()
+    if slice_type > 9:
+        raise BitstreamError(f"slice type {slice_type} is above 9")
+    return SliceStart(first_mb, slice_type % 5, pps_id, r.u(LOG2_MAX_FRAME_NUM))

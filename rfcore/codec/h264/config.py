@@ -207,6 +207,12 @@ class CodecConfig:
                 return level_idc
         raise InvalidInput("codec.size", f"{self.size_px} px fit no level of H.264")
 
+    @property
+    def vertical_range(self) -> int:
+        """How far vectors may reach up or down, in samples (MaxVmvR of table A-1)."""
+        level = self.level_idc
+        return 64 if level <= 10 else 128 if level <= 20 else 256 if level <= 30 else 512
+
 
 class LightChange(StrEnum):
     """Permission to change the light of a render before frames are predicted from it."""

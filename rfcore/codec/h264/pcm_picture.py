@@ -21,8 +21,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.codec.h264.bitstream import BitWriter, join_nals, nal_of_rbsp
-from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, NAL_PPS
+from rfcore.codec.h264.bitstream import (
+    LOG2_MAX_FRAME_NUM,
+    NAL_IDR,
+    NAL_P,
+    NAL_PPS,
+    NAL_REF_IDC,
+    BitWriter,
+    join_nals,
+    nal_of_rbsp,
+)
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
@@ -30,7 +38,6 @@ from rfcore.native import _native
 __all__ = ["PCM_PPS_ID", "PcmPictures", "PcmPlace", "pcm_pps", "without_zeros", "write_macroblocks"]
 
 PCM_PPS_ID = 1
-_NAL_REF_IDC = 3 << 5
 _I_SLICE_ONLY = 7
 _MB_TYPE_I_PCM = 25
 _MB_PX = 16
@@ -51,7 +58,7 @@ def pcm_pps() -> bytes:
     w.se(0).se(0).se(0)  # pic_init_qp - 26, pic_init_qs - 26, chroma_qp_index_offset
     w.u(1, 1)  # deblocking_filter_control_present_flag
     w.u(1, 0).u(1, 0)  # constrained_intra_pred_flag, redundant_pic_cnt_present_flag
-    return nal_of_rbsp(_NAL_REF_IDC | NAL_PPS, w.stop().to_bytes())
+    return nal_of_rbsp(NAL_REF_IDC | NAL_PPS, w.stop().to_bytes())
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,6 @@ class PcmPlace:
     IDR picture right before it (7.4.3).
     """
 
-    log2_max_frame_num: int
     frame_num: int = 0
     idr_pic_id: int = 0
 
@@ -119,7 +125,7 @@ def _slice_header(place: PcmPlace) -> bytes:
     """Return the NAL unit up to the first macroblock's samples (7.3.3, 7.3.5)."""
     w = BitWriter()
     w.ue(0).ue(_I_SLICE_ONLY).ue(PCM_PPS_ID)
-    w.u(place.log2_max_frame_num, place.frame_num)
+    w.u(LOG2_MAX_FRAME_NUM, place.frame_num)
     is_idr = place.frame_num == 0
     if is_idr:
         w.ue(place.idr_pic_id)
@@ -132,4 +138,4 @@ def _slice_header(place: PcmPlace) -> bytes:
     # The sample that follows is >= 1 and the last byte is not zero unless the bits were: a final
     # one bit stands in for what follows while emulation prevention is applied.
     nal_unit_type = NAL_IDR if is_idr else NAL_P
-    return nal_of_rbsp(_NAL_REF_IDC | nal_unit_type, w.to_bytes() + b"\x01")[:-1]
+    return nal_of_rbsp(NAL_REF_IDC | nal_unit_type, w.to_bytes() + b"\x01")[:-1]

@@ -1,10 +1,10 @@
 """Codes a picture as one H.264 slice against given pictures, without an encoder's own state.
 
-The slice refers to the parameter sets of a stream header. It is a P slice of ITU-T H.264 with
-CABAC: skipped macroblocks, partitions of 16x16 to 8x8 with a reference each, quarter-sample
-vectors, intra modes, 4x4 and 8x8 transforms; without references an I slice. The kernels
-(``csrc/h264``) compute in integers, so the same pictures and settings give the same bytes on every
-instruction set.
+The slice refers to the parameter sets of ``rfcore.codec.h264.header``. It is a P slice of ITU-T
+H.264 with CABAC: skipped macroblocks, partitions of 16x16 to 8x8 with a reference each,
+quarter-sample vectors, intra modes, 4x4 and 8x8 transforms; without references an I slice. The
+kernels (``csrc/h264``) compute in integers, so the same pictures and settings give the same bytes
+on every instruction set.
 
 A decision costs ``J = D + lambda R`` with squared error D and bits R as the arithmetic coder's
 states predict them; ``lambda`` follows the quantiser (Wiegand and Girod, ICIP 2001).
@@ -20,9 +20,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.codec.h264.bitstream import BitWriter, nal_of_rbsp
-from rfcore.codec.h264.header import StreamHeader, check_header
-from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, PictureParameters, parse_pps
+from rfcore.codec.h264.bitstream import (
+    LOG2_MAX_FRAME_NUM,
+    NAL_IDR,
+    NAL_P,
+    NAL_REF_IDC,
+    BitWriter,
+    nal_of_rbsp,
+)
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import DEFAULT_REFERENCES, INIT_QP
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
@@ -40,7 +47,6 @@ coefficients. A factor of 1.8 takes 0.1 to 1 % more bits and 3 % less time (defa
 30 Hz and high quantisers)."""
 MAX_QP = 60
 """Highest QP. Beyond 51 only lambda grows, by up to eight times, until little is left to code."""
-_NAL_REF_IDC = 0x60
 _P_SLICE, _I_SLICE = 0, 2
 _ANY_MODE = -1
 
@@ -137,18 +143,14 @@ class SliceCoder:
     """Codes pictures of one stream; may be shared between threads, which take turns.
 
     ``threads`` work on rows of macroblocks at the same time, each row behind the one above it; the
-    bytes do not depend on their number. Raises ``InvalidInput`` for a header that our streams
-    would not have or a number of threads out of range, and ``BackendUnavailable``
-    for an instruction set that this machine lacks.
+    bytes do not depend on their number. Raises ``InvalidInput`` for a number of threads out
+    of range, and ``BackendUnavailable`` for an instruction set that this machine lacks.
     """
 
-    def __init__(self, header: StreamHeader, *, threads: int = 1, isa: str | None = None) -> None:
-        sps = check_header(header)
-        self._log2_max_frame_num = sps.log2_max_frame_num
-        self._vertical_reach = 4 * _vertical_range(sps.level_idc) - 1
-        self._pps = parse_pps(header.pps)
-        self._size_px = header.config.size_px
-        self._reference_frames = header.config.reference_frames
+    def __init__(self, config: CodecConfig, *, threads: int = 1, isa: str | None = None) -> None:
+        self._vertical_reach = 4 * config.vertical_range - 1
+        self._size_px = config.size_px
+        self._reference_frames = config.reference_frames
         width_px, height_px = self._size_px
         self._native = _native.SliceCoder(width_px, height_px, check_backend(threads, isa), threads)
         self._macroblocks = -(-width_px // 16) * -(-height_px // 16)
@@ -207,11 +209,9 @@ class SliceCoder:
             reconstruction.planes,
             modes,
         )
-        header = _slice_header(
-            self._pps, self._log2_max_frame_num, len(references), slice_qp, deblocked
-        )
+        header = _slice_header(len(references), slice_qp, deblocked)
         unit = NAL_P if references else NAL_IDR
-        return OwnSlice(nal_of_rbsp(_NAL_REF_IDC | unit, header + data), reconstruction, modes)
+        return OwnSlice(nal_of_rbsp(NAL_REF_IDC | unit, header + data), reconstruction, modes)
 
     def _quantisers(self, qp: int, offsets: NDArray[np.int8] | None) -> NDArray[np.int8]:
         """Return the quantiser of every macroblock."""
@@ -247,36 +247,24 @@ class SliceCoder:
             )
 
 
-def _vertical_range(level_idc: int) -> int:
-    """Return how far vectors may reach up or down, in samples (MaxVmvR of table A-1)."""
-    return 64 if level_idc <= 10 else 128 if level_idc <= 20 else 256 if level_idc <= 30 else 512
-
-
-def _slice_header(
-    pps: PictureParameters, log2_max_frame_num: int, references: int, qp: int, deblocked: bool
-) -> bytes:
+def _slice_header(references: int, qp: int, deblocked: bool) -> bytes:
     """Return slice_header and the alignment before slice_data (7.3.3, 7.3.4), picture order 2."""
     w = BitWriter()
-    w.ue(0).ue(_P_SLICE if references else _I_SLICE).ue(pps.pps_id)
-    w.u(log2_max_frame_num, references)  # frame_num
+    w.ue(0).ue(_P_SLICE if references else _I_SLICE).ue(0)
+    w.u(LOG2_MAX_FRAME_NUM, references)  # frame_num
     if references:
-        override = references != pps.default_refs[0]
+        override = references != DEFAULT_REFERENCES
         w.u(1, override)
         if override:
             w.ue(references - 1)
         w.u(1, 0)  # ref_pic_list_modification_flag_l0
-        if pps.weighted_pred:
-            w.ue(0).ue(0)  # denominators
-            for _ in range(references):
-                w.u(1, 0).u(1, 0)
         w.u(1, 0)  # adaptive_ref_pic_marking_mode_flag
         w.ue(0)  # cabac_init_idc
     else:
         w.ue(0)  # idr_pic_id
         w.u(1, 0).u(1, 0)  # no_output_of_prior_pics_flag, long_term_reference_flag
-    w.se(qp - pps.init_qp)
-    if pps.deblocking_control:
-        w.ue(0 if deblocked else 1)
-        if deblocked:
-            w.se(0).se(0)
+    w.se(qp - INIT_QP)
+    w.ue(0 if deblocked else 1)
+    if deblocked:
+        w.se(0).se(0)
     return w.align(1).to_bytes()  # cabac_alignment_one_bit

@@ -33,16 +33,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from rfcore.codec.h264.bitstream import split_nals
+from rfcore.codec.h264.bitstream import NAL_IDR, NAL_P, NAL_PPS, NAL_SPS, nal_type, split_nals
 from rfcore.codec.h264.config import X264_REFERENCE_FRAMES, CodecConfig, preset_of
 from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, encode_pictures
-from rfcore.codec.h264.header import StreamHeader
-from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, NAL_PPS, NAL_SPS, nal_type
+from rfcore.codec.h264.header import stream_header
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
-__all__ = ["CodedSlice", "SliceCoding", "encode_slice", "slice_options"]
+__all__ = ["SliceCoding", "encode_slice", "slice_options"]
 
 _SUBME = {
     "ultrafast": 0,
@@ -86,14 +85,6 @@ _MAX_THREADS = 2
 
 
 @dataclass(frozen=True)
-class CodedSlice:
-    """One slice NAL unit without start code, and the parameter sets x264 wrote with it."""
-
-    header: StreamHeader
-    payload: bytes
-
-
-@dataclass(frozen=True)
 class SliceCoding:
     """Settings of one slice. ``crf`` replaces the configured one, ``qp_map`` is added to it.
 
@@ -114,12 +105,12 @@ def encode_slice(
     references: Sequence[I420],
     frame: I420,
     coding: SliceCoding = AS_CONFIGURED,
-) -> CodedSlice:
-    """Encode ``frame`` against ``references``, the last one reference 0; against none as an I
-    picture.
+) -> bytes:
+    """Return ``frame`` as a slice NAL unit against ``references``, the last one reference 0.
 
-    Raises ``CodecError`` if x264 makes anything but one slice of the frame, ``InvalidInput`` for
-    more references than its streams have. The caller checks sizes, and the header.
+    Without references it is an I picture. Raises ``CodecError`` if x264 writes other parameter sets
+    than ``stream_header`` or anything but one slice of the frame, ``InvalidInput`` for more
+    references than its streams have. The caller checks sizes.
     """
     if len(references) > X264_REFERENCE_FRAMES:
         raise InvalidInput(
@@ -132,13 +123,14 @@ def encode_slice(
         options = replace(options, params={**options.params, **_REGIONS_ON})
     units = encode_pictures(options, list(zip([*references, frame], kinds, strict=True)), regions)
     first = {nal_type(nal): nal for nal in split_nals(units[0])}
-    if not {NAL_SPS, NAL_PPS} <= first.keys():
-        raise CodecError(f"x264 made NAL units {sorted(first)} without parameter sets")
+    header = stream_header(config)
+    if (first.get(NAL_SPS), first.get(NAL_PPS)) != (header.sps, header.pps):
+        raise CodecError("x264 wrote other parameter sets than it was configured for")
     wanted = NAL_P if references else NAL_IDR
     slices = [nal for nal in split_nals(units[-1]) if nal_type(nal) in (NAL_P, NAL_IDR)]
     if [nal_type(nal) for nal in slices] != [wanted]:
         raise CodecError(f"x264 made slices {[nal_type(n) for n in slices]} of one picture")
-    return CodedSlice(StreamHeader(config, first[NAL_SPS], first[NAL_PPS]), slices[0])
+    return slices[0]
 
 
 def slice_options(

@@ -14,10 +14,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
-from rfcore.codec.h264.bitstream import join_nals
+from rfcore.codec.h264.bitstream import NAL_IDR, NAL_P, join_nals, nal_type, parse_slice_start
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.header import StreamHeader, check_header
-from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_start
 from rfcore.codec.h264.pcm_picture import PcmPictures, PcmPlace, pcm_pps
 from rfcore.errors import BitstreamError, CodecError
 from rfcore.image import I420
@@ -56,7 +55,7 @@ class SpliceDecoder:
         open_decoder: Callable[[tuple[int, int]], PictureDecoder] = H264Decoder,
     ) -> None:
         self._config = header.config
-        self._log2_max_frame_num = check_header(header).log2_max_frame_num
+        check_header(header)
         self._parameter_sets = join_nals([header.sps, header.pps, pcm_pps()])
         self._decoder = open_decoder(header.config.coded_size_px)
         self._pcm_pictures = PcmPictures(header.config.size_px)
@@ -70,7 +69,7 @@ class SpliceDecoder:
         if nal_type(payload) != expected_nal:
             kind = "a P picture's slice" if references else "an IDR picture's slice"
             raise BitstreamError(f"NAL unit type {nal_type(payload)} is not {kind}")
-        start = parse_slice_start(payload, self._log2_max_frame_num)
+        start = parse_slice_start(payload)
         fields = (start.first_mb, start.slice_type, start.pps_id, start.frame_num)
         expected = (0, _P_SLICE if references else _I_SLICE, 0, references)
         if fields != expected:
@@ -86,7 +85,7 @@ class SpliceDecoder:
         fed: Sequence[I420] = pictures or [I420.filled(self._config.size_px)]
         self._idr_pic_id ^= 3  # 1 and 2 by turns
         for frame_num, picture in enumerate(fed):
-            place = PcmPlace(self._log2_max_frame_num, frame_num, self._idr_pic_id)
+            place = PcmPlace(frame_num, self._idr_pic_id)
             sets = b"" if self._knows_parameter_sets else self._parameter_sets
             unit = self._pcm_pictures.access_unit(picture, place, sets)
             with self._fresh_after_errors():

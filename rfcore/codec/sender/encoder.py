@@ -155,8 +155,7 @@ class _Plan:
 
 
 class DeltaEncoder:
-    """Codes frames one by one. Raises ``CodecError`` if x264 writes other parameter sets than the
-    configuration calls for.
+    """Codes frames one by one. Raises ``CodecError`` if x264 is chosen and cannot be used.
 
     ``threads`` make references and code. References and our coder's slices do not depend on their
     number; x264's slices may differ by a few bytes between one thread and more. ``check_decode``:
@@ -193,10 +192,7 @@ class DeltaEncoder:
         self._threads = threads
         self._check_decode = check_decode
         self._coder = picture_coder(config, threads)
-        try:
-            self._splice = SpliceDecoder(self.header)
-        except InvalidInput as error:
-            raise CodecError(f"x264 wrote other parameter sets than asked for: {error}") from error
+        self._splice = SpliceDecoder(self.header)
 
     @property
     def header(self) -> StreamHeader:

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from rfcore.codec.h264.config import CodecConfig, Coder, coder_of
-from rfcore.codec.h264.header import StreamHeader, own_header
+from rfcore.codec.h264.header import StreamHeader, stream_header
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.h264.slice_coder import Effort, SliceCoder
 from rfcore.codec.h264.slices import SliceCoding, encode_slice
-from rfcore.errors import CodecError, InvalidInput
+from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
 __all__ = ["QP_OF_CRF", "CodedPicture", "CodingRequest", "PictureCoder", "picture_coder"]
@@ -68,8 +68,8 @@ def picture_coder(config: CodecConfig, threads: int = 1) -> PictureCoder:
 
 class _OwnPictureCoder:
     def __init__(self, config: CodecConfig, threads: int) -> None:
-        self.header = own_header(config)
-        self._coder = SliceCoder(self.header, threads=threads)
+        self.header = stream_header(config)
+        self._coder = SliceCoder(config, threads=threads)
 
     def code(self, frame: I420, references: Sequence[I420], request: CodingRequest) -> CodedPicture:
         _require_coder(request.effort, Coder.OWN)
@@ -88,16 +88,14 @@ class _X264PictureCoder:
         self._config = config
         self._threads = threads
         grey = I420.filled(config.size_px)
-        self.header = encode_slice(config, [grey], grey).header
+        encode_slice(config, [grey], grey)  # raises if there is no x264, or another one
+        self.header = stream_header(config)
 
     def code(self, frame: I420, references: Sequence[I420], request: CodingRequest) -> CodedPicture:
         _require_coder(request.effort, Coder.X264)
         config = replace(self._config, effort=request.effort)
         coding = SliceCoding(request.crf, request.qp_map, threads=self._threads)
-        coded = encode_slice(config, references, frame, coding)
-        if (coded.header.sps, coded.header.pps) != (self.header.sps, self.header.pps):
-            raise CodecError("x264 changed its parameter sets within a stream")
-        return CodedPicture(coded.payload)
+        return CodedPicture(encode_slice(config, references, frame, coding))
 
 
 def _require_coder(effort: str, coder: Coder) -> None:
