@@ -15,22 +15,7 @@ from tyro.conf import OmitSubcommandPrefixes
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfedge.cli import Verb
-
-KEYS = {
-    "frames",
-    "frames_reconstructed",
-    "digest_matches",
-    "payload_bytes",
-    "packet_bytes",
-    "wire_bytes",
-    "psnr_db",
-    "ssim",
-    "rf_psnr_db",
-    "paper_savings_percent",
-    "saving_vs_intra_percent",
-    "latency_ms",
-    "link_tau_error_percent",
-}
+from rfedge.demo.report import figures_of
 
 
 def demo(sample: Path, work: Path) -> subprocess.CompletedProcess[str]:
@@ -50,13 +35,11 @@ def test_the_server_ends_up_with_the_vehicles_pictures(tiny_sample: Path, tmp_pa
     done = demo(tiny_sample, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     result = json.loads((tmp_path / "demo" / "result.json").read_text())
-    assert set(result["sequences"]) == {"empty", "vehicles"}
+    assert set(figures_of(result)) == {"empty", "vehicles"}
     for entry in result["sequences"].values():
-        assert set(entry) >= KEYS
         assert entry["frames"] == entry["frames_reconstructed"] == entry["digest_matches"] == 4
         assert entry["payload_bytes"] < entry["packet_bytes"] < entry["wire_bytes"]
         assert entry["psnr_db"] > entry["rf_psnr_db"], "the delta improves on the render"
-        assert set(entry["latency_ms"]) == {"p50", "p99"}
     in_a_browser(done.stdout)
     page = (tmp_path / "demo" / "report.html").read_text()
     assert re.findall(r"(?:src|href)=.(?!data:|#)[^>]*", page) == [], "the page is self-contained"
