@@ -1,13 +1,26 @@
-"""Which tile takes each picture when servers come, go and publish anew."""
+"""Which tile each picture belongs to, and which takes it when servers come, go and publish anew."""
 
-from cav_agent.handover import LOST_AFTER_S, Handover, HandoverCause, ServedTile, TileRoute
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cav_agent.handover import (
+    LEAVE_SHARE,
+    LOST_AFTER_S,
+    Handover,
+    HandoverCause,
+    ServedTile,
+    TileRoute,
+)
+from rfcore.errors import InvalidInput
 from rfcore.wire.tiles import Area, Tile
 
 NEAR = 2
+MARGIN_M = 4.0
 
 
 def served(
-    server: int, west_m: float, east_m: float, version: int = 1, margin_m: float = 4.0
+    server: int, west_m: float, east_m: float, version: int = 1, margin_m: float = MARGIN_M
 ) -> ServedTile:
     field_id = f"{server}{version}" * 32
     area = Area((west_m, -5.0), (east_m, 5.0))
@@ -17,6 +30,61 @@ def served(
 A, B = served(0, -100, 0), served(1, 0, 100)
 POSITIONS = [(x, 0.0) for x in (-9.0, -6.0, -3.0, -1.0, 3.0, 6.0, 9.0)]
 """A is assigned up to number 3 and B from number 4; B's margin also covers numbers 2 and 3."""
+
+
+# --- the tiles of a drive
+
+
+def along(*east_m: float) -> list[tuple[float, float]]:
+    return [(x, 0.0) for x in east_m]
+
+
+def test_a_drive_passes_from_tile_to_tile() -> None:
+    route = TileRoute([A, B], along(-20, -10, 10, 20))
+    assert route.assigned == (A, A, B, B)
+    assert route.ahead(1, 2) == [A, B]
+    assert route.ahead(3, 2) == [B, A], "after the last picture comes the first"
+
+
+def test_driving_along_a_border_does_not_alternate_between_tiles() -> None:
+    inside_m = LEAVE_SHARE * MARGIN_M * 0.9
+    route = TileRoute([A, B], along(-1, inside_m, -1, inside_m, 20, -inside_m))
+    assert route.assigned == (A, A, A, A, B, B)
+
+
+def test_a_neighbour_is_in_range_as_far_as_its_margin() -> None:
+    route = TileRoute([A, B], along(-20, -MARGIN_M, -1, 1))
+    assert [route.in_range(i) for i in range(4)] == [
+        [A],
+        [A, B],
+        [A, B],
+        [B, A],
+    ]
+
+
+def test_a_tile_without_area_is_everywhere() -> None:
+    everywhere = ServedTile(0, Tile("street", "cd" * 32))
+    route = TileRoute([everywhere], along(-1e9, 0, 1e9))
+    assert set(route.assigned) == {everywhere}
+
+
+@given(st.lists(st.floats(-150, 150), min_size=1, max_size=20))
+def test_the_assigned_tile_is_never_farther_than_staying_allows(east_m: list[float]) -> None:
+    route = TileRoute([A, B], along(*east_m))
+    for assigned, position in zip(route.assigned, along(*east_m), strict=True):
+        nearest_m = min(served.tile.distance_m(*position) for served in route.tiles)
+        allowed_m = max(nearest_m, LEAVE_SHARE * MARGIN_M)
+        assert assigned.tile.distance_m(*position) <= allowed_m
+
+
+def test_a_route_needs_tiles_and_positions() -> None:
+    with pytest.raises(InvalidInput, match="0 tiles"):
+        TileRoute([], along(0))
+    with pytest.raises(InvalidInput, match="0 positions"):
+        TileRoute([A], [])
+
+
+# --- servers that come and go
 
 
 def handover(*tiles: ServedTile) -> Handover:

@@ -178,13 +178,6 @@ def test_the_oldest_frame_is_overdue_first(in_flight: FramesInFlight) -> None:
     assert in_flight.timeout_at() == 7.0
 
 
-def test_without_frames_nothing_is_overdue() -> None:
-    empty = FramesInFlight(LIMITS)
-    assert empty.timeout_at() is None
-    assert empty.longest_wait_s(9.0) == 0.0
-    assert len(empty) == 0
-
-
 def test_a_frame_may_take_longer_behind_others_on_a_slow_link(
     make_capture: MakeCapture,
 ) -> None:
@@ -199,23 +192,6 @@ def test_a_frame_may_take_longer_behind_others_on_a_slow_link(
     assert frames.timeout_at() == pytest.approx(10.0 + waits[0])
     frames.pop(address(1))
     assert frames.timeout_at() == pytest.approx(10.0 + waits[1])
-
-
-def test_link_time_runs_from_sending_and_excludes_the_servers_own(
-    in_flight: FramesInFlight,
-) -> None:
-    in_flight.sent(address(0), 1.25)
-    frame = in_flight.acked(Ack(address(0), StageTimes(total_ns=500_000_000), b"x" * 16), 2.0)
-    assert frame is not None
-    assert frame.result.link_s == pytest.approx(0.25)
-    assert frame.result.server_digest == b"x" * 16
-
-
-def test_an_answer_to_a_frame_that_is_not_in_flight_changes_nothing(
-    in_flight: FramesInFlight,
-) -> None:
-    assert in_flight.acked(Ack(address(7), StageTimes(), b""), 2.0) is None
-    assert in_flight.addresses == [address(0), address(1), address(2)]
 
 
 @pytest.mark.parametrize(
@@ -237,17 +213,6 @@ def test_a_refusal_is_about_the_frames_it_names_or_about_all_if_it_could_not_rea
 # --- what the next frame is predicted from
 
 
-def test_a_new_epoch_goes_back_to_the_last_decoded_frame() -> None:
-    chain = PredictionChain(0)
-    chain.started()
-    chain.sent(address(0))
-    chain.decoded(address(0))
-    chain.sent(address(1))
-    assert chain.base == address(1)
-    chain.restart()
-    assert (chain.epoch, chain.base) == (1, address(0))
-
-
 def test_an_epoch_without_a_packet_is_used_again() -> None:
     chain = PredictionChain(4)
     chain.restart()
@@ -255,28 +220,3 @@ def test_an_epoch_without_a_packet_is_used_again() -> None:
     chain.started()
     chain.restart()
     assert chain.epoch == 5
-
-
-def test_a_new_epoch_is_later_than_the_servers() -> None:
-    chain = PredictionChain(0)
-    chain.restart(above=9)
-    assert chain.epoch == 10
-
-
-def test_a_frame_the_server_lost_is_no_base_and_another_is() -> None:
-    chain = PredictionChain(0)
-    chain.decoded(address(3))
-    chain.unknown_to_server(address(2))
-    chain.restart()
-    assert chain.base == address(3)
-    chain.unknown_to_server(address(3))
-    chain.restart()
-    assert chain.base is None
-
-
-def test_another_connection_begins_without_a_base() -> None:
-    chain = PredictionChain(0)
-    chain.decoded(address(3))
-    chain.forget()
-    chain.restart()
-    assert chain.base is None

@@ -137,23 +137,6 @@ def test_credit_never_falls(
     send(session, make_capture(1), encode)
 
 
-def test_one_picture_is_encoded_at_a_time(session: AgentSession, make_capture: MakeCapture) -> None:
-    session.offer(make_capture(0))
-    assert session.job_to_start(0.0) is not None
-    session.offer(make_capture(1))
-    assert session.job_to_start(0.0) is None
-
-
-def test_a_frame_carries_the_pose_the_field_and_the_capture_time(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    capture = make_capture(5)
-    frame = send(session, capture, encode)
-    assert frame.capture_time_ns == 1005
-    assert frame.pose == capture.picture.camera.world_from_cam
-    assert frame.field_id_prefix == b"", "the only field of Hello"
-
-
 def test_an_ack_ends_a_picture_with_its_sizes_and_times(
     session: AgentSession, make_capture: MakeCapture, encode: Encode
 ) -> None:
@@ -417,14 +400,6 @@ def test_how_long_an_answer_was_waited_for_is_in_the_problem_and_not_in_the_reas
     session.connection_lost(session.broken, timer)
     (result,) = session.take_results()
     assert str(result.reason) == "no_answer"
-
-
-def test_the_rate_that_a_welcome_grants_is_kept(hello: Hello) -> None:
-    session = AgentSession(hello)
-    session.connected(0.0)
-    assert session.rate_limit_hz == 0.0
-    session.receive(Welcome("s-1", exact=True, rate_hz=7.5), 0.0)
-    assert session.rate_limit_hz == 7.5
 
 
 @pytest.mark.parametrize(
