@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from cav_agent.capture_schedule import CaptureSchedule, recorded_schedule
 from cav_agent.config import AgentConfig
 from cav_agent.frames import Capture
 from rfcore.camera import Intrinsics, Pose, TileOrigin
@@ -63,6 +64,14 @@ class VehicleCameras(Protocol):
     def cameras(self) -> tuple[VehicleCamera, ...]:
         """The cameras; the first is the one by which poses are known."""
 
+    @property
+    def positions(self) -> tuple[Position, ...]:
+        """Where the vehicle is at each place of the drive."""
+
+    @property
+    def schedule(self) -> CaptureSchedule:
+        """When pictures are captured."""
+
     def __len__(self) -> int:
         """Return the number of places on the drive."""
 
@@ -78,11 +87,13 @@ class RecordedCameras:
 
     def __init__(
         self,
+        config: AgentConfig,
         cameras: tuple[VehicleCamera, ...],
         instants: Sequence[RigInstant],
         numbers: Iterator[int],
     ) -> None:
         self.cameras = cameras
+        self.schedule = recorded_schedule(config, len(instants), len(cameras))
         self._instants = tuple(instants)
         self._numbers = numbers
 
@@ -135,13 +146,13 @@ def recorded_cameras(
             VehicleCamera.on_rig(camera, first[camera.name].camera.intrinsics)
             for camera in rig.cameras
         )
-        return RecordedCameras(tuple(cameras), instants, numbers)
+        return RecordedCameras(config, tuple(cameras), instants, numbers)
     pictures = _read_drive(config, origin)
     camera = VehicleCamera(config.camera, pictures[0].camera.intrinsics, config.masking)
     alone = [
         RigInstant(picture.camera.world_from_cam, {config.camera: picture}) for picture in pictures
     ]
-    return RecordedCameras((camera,), alone, numbers)
+    return RecordedCameras(config, (camera,), alone, numbers)
 
 
 def _read_drive(config: AgentConfig, origin: TileOrigin) -> list[PosedPicture]:

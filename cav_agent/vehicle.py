@@ -35,8 +35,7 @@ from cav_agent.camera_poses import (
     RigPoses,
     TrackedRigPoses,
 )
-from cav_agent.cameras import instant_numbers, recorded_cameras
-from cav_agent.capture_schedule import recorded_schedule
+from cav_agent.cameras import VehicleCameras, instant_numbers, recorded_cameras
 from cav_agent.client import CameraSource, StreamClient, StreamOwner
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.field_cache import FieldCache, PreparedCamera, PreparedField
@@ -61,13 +60,13 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField
 from rfcore.wire.checks import check_name
 from rfcore.wire.conventions import RENDERER_CONTRACT
-from rfcore.wire.instruments import MetricsEndpoint
+from rfcore.wire.instruments import Family, MetricsEndpoint
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.tiles import Tile
 
-__all__ = ["SEARCH_NICENESS", "Vehicle", "yield_to_frames"]
+__all__ = ["SEARCH_NICENESS", "Vehicle", "metric_families", "yield_to_frames"]
 
 SEARCH_NICENESS = 5
 """Niceness of the thread that searches poses. Beside it frames take as long as alone: 25 ms on two
@@ -139,9 +138,8 @@ class Vehicle:
         """Open what the drive needs; ``stack`` closes it."""
         config, changed = self._config, asyncio.Event()
         rig = None if config.rig is None else _read_rig(config)
-        is_live = config.live.source is not None or (rig is not None and rig.is_live)
         recorded = None
-        if not is_live:
+        if config.live.source is None and not (rig and rig.is_live):
             recorded = await asyncio.to_thread(
                 recorded_cameras, config, TileOrigin(), instant_numbers(config)
             )
@@ -154,8 +152,11 @@ class Vehicle:
         addresses = [server.address for server in self._servers]
         takers = await self._notice_takers(stack)
         observer = DriveObserver(self._metrics, addresses, frame_log, takers)
-        if is_live:
-            self._live = await self._open_live(stack, rig, observer, changed)
+        cameras: VehicleCameras
+        if recorded is None:
+            cameras = self._live = await self._open_live(stack, rig, observer, changed)
+        else:
+            cameras = recorded
         fields = FieldCache(config, self._servers, observer, self._live)
         stack.push_async_callback(fields.close)
         feed = await self._open_feed(stack, observer)
@@ -173,13 +174,8 @@ class Vehicle:
             self._live,
             take_notices=bool(takers),
         )
-        prepare = streams.prepare
-        if self._live is not None:
-            positions, live_schedule = self._live.positions, self._live.schedule
-            return HandoverController(config, positions, live_schedule, prepare, observer, changed)
-        assert recorded is not None
-        schedule = recorded_schedule(config, len(recorded), len(recorded.cameras))
-        return HandoverController(config, recorded.positions, schedule, prepare, observer, changed)
+        positions, schedule = cameras.positions, cameras.schedule
+        return HandoverController(config, positions, schedule, streams.prepare, observer, changed)
 
     async def _notice_takers(self, stack: AsyncExitStack) -> list[Callable[[StreetNotice], None]]:
         """Return what is called with notices; ``stack`` closes the socket, if there is one."""
@@ -442,6 +438,13 @@ def _read_rig(config: AgentConfig) -> Rig:
     if rig.is_live and config.pace is not PaceKind.REALTIME:
         raise InvalidInput("pace", f"{config.pace}: a live camera does not wait, use realtime")
     return rig
+
+
+def metric_families() -> Sequence[Family]:
+    """Return the metrics that an agent exports, with everything that an option can add."""
+    metrics = AgentMetrics(CollectorRegistry())
+    metrics.identify("cav-1", "front")
+    return metrics.instruments.families
 
 
 def yield_to_frames() -> None:

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from prometheus_client import CollectorRegistry
 
-from cav_agent.metrics import AgentMetrics
-from mec_server.server import metric_families
+from cav_agent import vehicle
+from mec_server import server
 from rfcore.wire.instruments import Family
 from rfedge.link.metrics import LinkMetrics
 
@@ -16,10 +16,8 @@ __all__ = ["families"]
 
 def families() -> Mapping[str, Sequence[Family]]:
     """Return what each command declares, with everything that a flag can add."""
-    agent = AgentMetrics(CollectorRegistry())
-    agent.identify("cav-1", "front")
     return {
-        "mec-server": metric_families(),
-        "cav-agent": agent.instruments.families,
+        "mec-server": server.metric_families(),
+        "cav-agent": vehicle.metric_families(),
         "rfedge link": LinkMetrics(CollectorRegistry()).instruments.families,
     }

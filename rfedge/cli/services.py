@@ -52,22 +52,7 @@ class Link:
         """Forward until SIGTERM or SIGINT."""
         from rfedge.link.proxy import ProxySettings, run_proxy
 
-        run_proxy(
-            ProxySettings(
-                listen=self.listen,
-                to=self.to,
-                also=self.also,
-                uplink_bps=self.uplink_bps,
-                downlink_bps=self.downlink_bps,
-                delay_ms=self.delay_ms,
-                profile=self.profile,
-                metrics_port=self.metrics_port,
-                metrics_host=self.metrics_host,
-                report=self.report,
-                ready_file=self.ready_file,
-                allow_insecure=self.allow_insecure,
-            )
-        )
+        run_proxy(ProxySettings(**vars(self)))
 
 
 @dataclass(frozen=True)
