@@ -1,7 +1,7 @@
-"""Make the demo's drives: there and back again along the sample street, in four ways.
+"""Make the drives of docker-compose.yml: along the sample street and back, for four vehicles.
 
-``python deploy/compose/drives.py FOLDER`` writes one transforms file a vehicle, for a place beside
-the picture folders of ``samples/street``. A drive that comes back is repeated without a jump.
+``python deploy/compose/drives.py FOLDER`` writes a transforms file for each vehicle. It belongs
+beside the picture folders of ``samples/street``. A drive that comes back repeats without a jump.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DRIVES = {
     "cav-3": ("drive_vehicles", range(12)),
     "cav-4": ("drive_empty", range(12, 24)),
 }
-"""Whose camera sees what: cav-1 and cav-2 pass from one tile to the other, the others stay."""
+"""Recorded drive and frames of each vehicle; cav-1 and cav-2 pass between tiles, others stay."""
 
 
 def write_drives(folder: Path) -> None:

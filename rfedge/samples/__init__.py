@@ -15,7 +15,7 @@ CHECKOUT = PACKAGED.parents[1] / "samples"
 
 
 def sample_path(name: str) -> Path:
-    """Return where the sample ``name`` is: a file or folder such as ``street``, ``links/drive.up``.
+    """Return the path of a sample, a file or folder such as ``street`` or ``links/drive.up``.
 
     It is looked for in ``samples/`` of the working folder, then of the checkout, then of the wheel.
     The path of a sample that is nowhere (images carry none) is in the working folder, so that the

@@ -1,4 +1,4 @@
-"""What the authority signs says the right thing, and lies on disk as it should."""
+"""The authority signs the right names, and keys are for their owner alone."""
 
 import stat
 from datetime import UTC, datetime

@@ -111,7 +111,7 @@ def test_the_version_is_that_of_the_distribution() -> None:
 
 
 def test_the_help_loads_nothing_heavy() -> None:
-    """What makes ``--help`` slow is imports (torch alone takes seconds), so those are counted."""
+    """Imports make ``--help`` slow (torch alone takes seconds), so they are looked for."""
     code = (
         f"import sys; import rfedge.cli; print([name for name in {HEAVY!r} if name in sys.modules])"
     )

@@ -28,7 +28,7 @@ def kustomization() -> dict[str, Any]:
 
 
 def resources(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
-    """What a kustomization lists in files of its own, by kind and name."""
+    """Return the resources in the files that a kustomization lists, by kind and name."""
     listed = yaml.safe_load((folder / "kustomization.yaml").read_text())["resources"]
     texts = [(folder / name).read_text() for name in listed if name.endswith(".yaml")]
     read = [document for text in texts for document in yaml.safe_load_all(text)]

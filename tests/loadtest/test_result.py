@@ -1,4 +1,4 @@
-"""The result of a load test: what is written is what was measured, and rows are kept by load."""
+"""The result of a load test has what was measured; the search finds the limit."""
 
 import io
 import json

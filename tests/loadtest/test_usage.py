@@ -1,4 +1,4 @@
-"""What processes use, from samples with an answer by algebra, and of this very process."""
+"""Use of processes: samples with an answer by algebra, and this very process."""
 
 import threading
 
