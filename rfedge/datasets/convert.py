@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import astuple
 from pathlib import Path
 
@@ -13,10 +14,10 @@ from rfcore.dataset.source import SourceCamera, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput
 from rfcore.files import whole_folder
-from rfcore.geodesy import Anchor
 from rfcore.image import write_png
+from rfcore.views import PosedPicture
 
-__all__ = ["convert_dataset", "global_anchor"]
+__all__ = ["convert_dataset", "global_points", "write_in_own_world"]
 
 
 def convert_dataset(
@@ -34,35 +35,44 @@ def convert_dataset(
     pictures = dataset.pictures[chosen]
     if not pictures:
         raise InvalidInput("offset", f"leaves none of the {len(dataset.pictures)} pictures")
-    timed = any(picture.time_ns for picture in dataset.pictures)
-    written = []
     with whole_folder(out) as folder:
-        (folder / "images").mkdir()
-        for i, picture in enumerate(pictures):
-            name = f"images/{i:06d}.png"
-            write_png(folder / name, picture.read())
-            written.append(
-                WrittenPicture(
-                    file_path=name,
-                    camera=SourceCamera(picture.camera.intrinsics),
-                    world_from_cam=dataset.tile_origin.globalise(picture.camera.world_from_cam),
-                    time_ns=picture.time_ns if timed else None,
-                )
-            )
-        write_transforms(folder, written, _global_points(dataset), global_anchor(dataset))
+        write_in_own_world(folder, dataset, enumerate(pictures), global_points(dataset))
     lens = f", {dataset.undistorted} of the dataset's undistorted" if dataset.undistorted else ""
-    return f"{out}: {len(written)} pictures{lens}"
+    return f"{out}: {len(pictures)} pictures{lens}"
 
 
-def global_anchor(dataset: Dataset) -> Anchor | None:
-    """Return the anchor of the dataset's own world, where it states one."""
-    if dataset.anchor is None:
-        return None
-    east_m, north_m, up_m = astuple(dataset.tile_origin)
-    return dataset.anchor.relative_to(TileOrigin(-east_m, -north_m, -up_m))
+def write_in_own_world(
+    folder: Path,
+    dataset: Dataset,
+    numbered: Iterable[tuple[int, PosedPicture]],
+    points: SourcePoints | None,
+) -> None:
+    """Write pictures, points and anchor of a dataset in its own world, without a tile's origin.
+
+    The pictures are named by their numbers.
+    """
+    (folder / "images").mkdir(parents=True)
+    timed = any(picture.time_ns for picture in dataset.pictures)
+    origin, anchor = dataset.tile_origin, dataset.anchor
+    written = []
+    for number, picture in numbered:
+        name = f"images/{number:06d}.png"
+        write_png(folder / name, picture.read())
+        written.append(
+            WrittenPicture(
+                file_path=name,
+                camera=SourceCamera(picture.camera.intrinsics),
+                world_from_cam=origin.globalise(picture.camera.world_from_cam),
+                time_ns=picture.time_ns if timed else None,
+            )
+        )
+    if anchor is not None:
+        anchor = anchor.relative_to(TileOrigin(-origin.east_m, -origin.north_m, -origin.up_m))
+    write_transforms(folder, written, points, anchor)
 
 
-def _global_points(dataset: Dataset) -> SourcePoints | None:
+def global_points(dataset: Dataset) -> SourcePoints | None:
+    """Return the points in the dataset's own world."""
     if dataset.points is None:
         return None
     xyz_m = dataset.points.xyz_m + np.array(astuple(dataset.tile_origin))

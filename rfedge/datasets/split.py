@@ -20,13 +20,10 @@ from numpy.typing import NDArray
 
 from rfcore.camera import TileOrigin
 from rfcore.dataset import Dataset, read_dataset
-from rfcore.dataset.source import SourceCamera, SourcePoints
-from rfcore.dataset.write import WrittenPicture, write_transforms
+from rfcore.dataset.source import SourcePoints
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.files import whole_folder, write_whole
-from rfcore.image import write_png
-from rfcore.views import PosedPicture
-from rfedge.datasets.convert import global_anchor
+from rfedge.datasets.convert import global_points, write_in_own_world
 
 __all__ = ["LIST_NAME", "SplitSettings", "SplitTile", "read_tiles", "split_dataset", "tiles_of"]
 
@@ -160,37 +157,19 @@ def _write_tile(
     folder: Path, dataset: Dataset, tile: SplitTile, settings: SplitSettings
 ) -> TileOrigin:
     """Write a tile's dataset; return the origin that readers choose for it."""
-    (folder / "images").mkdir(parents=True)
-    timed = any(picture.time_ns for picture in dataset.pictures)
-    written = [
-        _write_picture(folder, dataset.pictures[i], i, dataset.tile_origin, timed)
-        for i in tile.pictures
-    ]
+    numbered = ((i, dataset.pictures[i]) for i in tile.pictures)
     points = _points_near(dataset, tile.area_m, settings.points_m)
-    write_transforms(folder, written, points, global_anchor(dataset))
+    write_in_own_world(folder, dataset, numbered, points)
     return read_dataset(folder).tile_origin
 
 
-def _write_picture(
-    folder: Path, picture: PosedPicture, index: int, origin: TileOrigin, timed: bool
-) -> WrittenPicture:
-    name = f"images/{index:06d}.png"
-    write_png(folder / name, picture.read())
-    return WrittenPicture(
-        file_path=name,
-        camera=SourceCamera(picture.camera.intrinsics),
-        world_from_cam=origin.globalise(picture.camera.world_from_cam),
-        time_ns=picture.time_ns if timed else None,
-    )
-
-
 def _points_near(dataset: Dataset, area_m: Area, within_m: float) -> SourcePoints | None:
-    if dataset.points is None:
+    points = global_points(dataset)
+    if points is None:
         return None
-    xyz_m = dataset.points.xyz_m + np.array(astuple(dataset.tile_origin))
     low_m, high_m = np.array(area_m[:2]) - within_m, np.array(area_m[2:]) + within_m
-    near = ((xyz_m[:, :2] >= low_m) & (xyz_m[:, :2] <= high_m)).all(axis=1)
-    return SourcePoints(xyz_m[near], dataset.points.rgb[near]) if near.any() else None
+    near = ((points.xyz_m[:, :2] >= low_m) & (points.xyz_m[:, :2] <= high_m)).all(axis=1)
+    return SourcePoints(points.xyz_m[near], points.rgb[near]) if near.any() else None
 
 
 def _listed(tile: SplitTile, origin: TileOrigin) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from rfcore.camera import Intrinsics, Pose, camera_on_rig
 from rfcore.codec.h264.config import EFFORTS
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.field import Quality
+from rfcore.localise.estimate import LocalisationState
 from rfcore.wire.convert import (
     FrameRefused,
     client_message_from_bytes,
@@ -33,6 +34,7 @@ from rfcore.wire.messages import (
     Welcome,
 )
 from rfcore.wire.v1 import edge_pb2 as pb
+from rfcore.wire.values import ClockKind
 
 fixtures_are_frozen = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -328,3 +330,19 @@ def test_a_coder_that_is_not_known_here_is_refused_by_name(hello: Hello, effort:
     request.hello.cameras[0].codec.effort = effort
     with pytest.raises(InvalidInput, match=f"effort: '{effort}' is none of fast"):
         client_message_from_bytes(request.SerializeToString())
+
+
+@pytest.mark.parametrize("clock", [None, *ClockKind])
+@pytest.mark.parametrize("localisation", [None, *LocalisationState])
+def test_clock_and_localisation_survive_the_wire(
+    frame: Frame, clock: ClockKind | None, localisation: LocalisationState | None
+) -> None:
+    said = replace(frame, clock=clock, localisation=localisation)
+    assert client_message_from_bytes(client_message_to_bytes(said)) == said
+
+
+def test_a_number_of_a_newer_peer_counts_as_not_said(frame: Frame) -> None:
+    request = pb.StreamRequest.FromString(client_message_to_bytes(frame))
+    request.frame.capture_clock = 99  # type: ignore[assignment]
+    request.frame.localisation = 99  # type: ignore[assignment]
+    assert client_message_from_bytes(request.SerializeToString()) == frame
