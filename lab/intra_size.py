@@ -1,4 +1,4 @@
-"""How large a scene's pictures are as I pictures: whether they are as detailed as real ones.
+"""``rfedge-lab intra-size``: the sizes of a scene's pictures as I pictures, beside real ones.
 
 Each picture is a stream of its own, coded by x264 as its preset says, as the first picture of a
 10 Hz stream: that is the rate of the published drives, and x264 spends more on pictures that are
@@ -29,7 +29,7 @@ __all__ = ["EvalIntraSize", "IntraCoding", "SceneSizes", "intra_bytes", "sizes_o
 
 @dataclass(frozen=True)
 class IntraCoding:
-    """How x264 is set, one thread."""
+    """Settings of x264, one thread."""
 
     crf: float = 23.0
     rate_hz: int = 10

@@ -40,7 +40,7 @@ COMMAND = "make sample"
 
 @dataclass(frozen=True)
 class Coding:
-    """How pictures are stored: OpenCV's file type and settings."""
+    """The storage of pictures: OpenCV's file type and settings."""
 
     suffix: str
     settings: tuple[int, ...]
@@ -82,7 +82,7 @@ PARTS = (
 
 @dataclass(frozen=True)
 class Packed:
-    """What a part writes: coded pictures by their path in the sample, and its transforms file."""
+    """A part's coded pictures by their path in the sample, and its transforms file."""
 
     part: Part
     pictures: Mapping[str, bytes]
@@ -135,7 +135,7 @@ def pack_sample(built: Path, sample: Path) -> None:
 
 
 def _made_by(folder: Path) -> Mapping[str, Any]:
-    """What the build's own manifest says of it, but for its list of files."""
+    """The build's own manifest, but for its list of files."""
     try:
         about = json.loads((folder / "manifest.json").read_bytes())
     except (OSError, ValueError) as error:

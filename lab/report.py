@@ -1,4 +1,4 @@
-"""How results of one kind become a page: a sentence, a picture, tables, and how they were measured.
+"""Makes a page of the results of one kind: a sentence, a picture, tables, and their command.
 
 A page is made of every result file of its kind, a section each, so that it is never typed.
 """
@@ -23,12 +23,12 @@ BAR_IN = 0.22
 
 @dataclass(frozen=True)
 class Report:
-    """How results of one kind are shown."""
+    """The page of results of one kind."""
 
     kind: str
     title: str
     shows: str
-    """What the page shows, in a sentence."""
+    """A sentence that says what the page shows."""
     parts: Parts
     draw: Draw | None = None
 

@@ -46,7 +46,7 @@ MAX_SLOPE_MB = 1.0
 """Per minute."""
 
 LEAST_SHARE = 0.5
-"""Of the frames that were due; with fewer reconstructed the server was not at half load."""
+"""Share of the frames that were due; with fewer reconstructed the server was not at half load."""
 
 QUARTERS = 4
 """The least counts in the last quarter of the run are compared with those in the first."""
@@ -59,9 +59,9 @@ class SoakSettings:
     """Let a server work for long, and see that nothing grows."""
 
     minutes: float = 30.0
-    """How long, after a warm-up."""
+    """Minutes of load after a warm-up."""
     vehicles: int = 2
-    """How many send pictures."""
+    """Number of vehicles that send pictures."""
     hz: float = 5.0
     """Pictures per second of each."""
     warm_up: float = 60.0

@@ -59,7 +59,7 @@ CellKey = Mapping[str, str | float | int | None]
 Rows = list[dict[str, Any]]
 LOCAL = "local"
 RETRIES = 3
-"""How often a job is begun again whose process was killed."""
+"""A job whose process was killed is begun again at most so often."""
 MOST_PROCESSES = 256
 POLL_S = 0.2
 REACHED_WITHIN_S = 10.0

@@ -60,7 +60,7 @@ STANDARD_OUTPUT = "-"
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a result was made: enough to make it again, and to tell whether that is possible."""
+    """The origin of a result: enough to make it again, and to tell whether that is possible."""
 
     command: str
     """The command line, quoted for a shell."""

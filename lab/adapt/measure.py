@@ -1,4 +1,4 @@
-"""What another light costs in bits, and how much of it each way of adapting wins back.
+"""Measures the bits that another light costs, and how many each way of adapting wins back.
 
 A *variant* is how a drive is coded: ``off``, with the field as it is; ``matrix``, with the sender's
 matrix of colours (``rfcore.codec.photometric``) wherever it chooses to send one; ``auto``, as
@@ -131,7 +131,7 @@ class AdaptRow:
     """Frames under the light of the one before, or under one that was sent, at the rate nearest to
     33 dB."""
     switches: int | None = field(default=None, metadata=shown("switches"))
-    """How often frames begin or cease to be relit there."""
+    """Number of times that frames begin or cease to be relit there."""
     first_kbit_33db: float | None = field(
         default=None, metadata=shown("first frame, kbit at 33 dB", ".1f")
     )
@@ -249,7 +249,7 @@ def second_vehicle_percent(
 
 @dataclass(frozen=True)
 class _CaseMeasuring:
-    """What every variant of one case is measured with."""
+    """The inputs that all variants of one case share."""
 
     job: EvalAdapt
     case: AdaptCase
@@ -321,7 +321,7 @@ class _CaseMeasuring:
             "scene": drive.name.scene,
             "frames": drive.digest,
             "field": load_field(self.case.own).field_id,
-            "times": program_version(),
+            "times": program_version("lab/adapt"),
         }
 
         def make() -> list[dict[str, Any]]:
@@ -349,7 +349,7 @@ class _CaseMeasuring:
         coder = FieldCoder(
             rendered,
             f"rfedge-{variant}-{self.job.effort}-{rendered.field_id[:12]}",
-            program_version(),
+            program_version("lab/adapt"),
             effort=self.job.effort,
             photometric=photometric,
             relight=relight,

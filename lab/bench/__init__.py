@@ -21,7 +21,7 @@ __all__ = ["CASES", "Bench", "Rows", "print_rows", "run_case"]
 
 CASES = ("raster", "train", "codec", "ngp", "decoders")
 Rows = Literal["all", "native", "modes"]
-"""Which rows to run: ``native`` leaves out what only the slow reference fills in, ``modes`` are
+"""Rows to run: ``native`` leaves out what only the slow reference fills in, ``modes`` are
 the specialisations of the renderer instead."""
 
 
@@ -30,7 +30,7 @@ class Bench:
     """Check a part against its definition, then time it: medians of at least 20 repetitions."""
 
     case: Annotated[Literal["raster", "train", "codec", "ngp", "decoders"], Positional]
-    """What to measure."""
+    """The case to measure."""
     rows: Literal["all", "native", "modes"] = "all"
     """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
     antialiasing, depth and opacity cost, as ratios (raster only)."""

@@ -61,7 +61,7 @@ KINDS = (
     DecoderKind.BUBBLEWRAP,
 )
 LAPS = 5
-"""How many times the drive is decoded, after one pass to warm up."""
+"""Number of times that the drive is decoded, after one pass to warm up."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class CodecRow:
     effort: str
     payload_bytes: float
     psnr_db: float
-    """Of the luma; times of two coders compare where it is about the same."""
+    """PSNR of the luma; times of two coders compare where it is about the same."""
     sender_ms: Mapping[str, float]
     receiver_ms: Mapping[str, float]
 

@@ -49,7 +49,7 @@ __all__ = [
 
 OPENCL_SIZES_PX = ((640, 360), (1920, 1080))
 CPU_THREADS = os.cpu_count() or 1
-"""Of the CPU's renderer beside a device: all there are."""
+"""Threads of the CPU's renderer when it is compared with a device: all there are."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class OpenClRow:
     device_view_ms: float
     isa: str
     threads: int
-    """Of the CPU, whose ``native_ms`` stands beside the device's."""
+    """Threads of the CPU that ``native_ms`` is of."""
     native_ms: float
     native_view_ms: float
     ratio: float

@@ -23,7 +23,7 @@ STREET_GAUSSIANS = 200_000
 STREET_SEED = 1
 FIELD_OF_VIEW_DEG = 70.0
 SHARES = {"facades": 0.38, "road": 0.2, "sky": 0.08, "trees": 0.2}
-"""Of all Gaussians; cars get the rest."""
+"""Shares of all Gaussians; cars get the rest."""
 
 F64 = NDArray[np.float64]
 Rng = np.random.Generator

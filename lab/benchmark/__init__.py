@@ -36,16 +36,16 @@ class BenchmarkRun:
     """The codec: a program with {frames}, {point} and {out}, and where it wants them {hz} and
     {prior}. No shell runs it."""
     name: str
-    """What the method is called in results."""
+    """Name of the method in results."""
     points: tuple[float, ...]
     """Operating points, what {point} stands for: at least six, from 32 to 35 dB and beyond."""
     version: str = "unknown"
-    """Of the method."""
+    """Version of the method."""
     only: tuple[str, ...] = ()
     """Drives to code, by name; those that the benchmark requires if none is given. With fewer it
     cannot be checked."""
     drive: Annotated[tuple[str, ...], arg(metavar="NAME=DATASET")] = ()
-    """Where drives lie that are not among the samples; they are coded, too."""
+    """Datasets of drives that are not among the samples; they are coded, too."""
     prior: tuple[Path, ...] = ()
     """Files that both ends hold beforehand, such as a field; they become part of the submission."""
     timeout_s: float = 3600.0
@@ -88,7 +88,7 @@ class BenchmarkCheck:
     """A program that makes the pictures from the packets alone: {packets} and {out}, and where it
     wants them {point} and {prior}. Name one that you trust: it runs with your rights."""
     drive: Annotated[tuple[str, ...], arg(metavar="NAME=DATASET")] = ()
-    """Where drives lie that are not among the samples."""
+    """Datasets of drives that are not among the samples."""
     timeout_s: float = 3600.0
     """Longest time of the decoder on one drive at one point."""
     out: Path = Path("out/eval/benchmark.json")
@@ -145,7 +145,7 @@ class BenchmarkAnchors:
     """
 
     drive: Annotated[tuple[str, ...], arg(metavar="NAME=DATASET")] = ()
-    """Where drives lie that are not among the samples. Drives that are not here are left out."""
+    """Datasets of drives that are not among the samples; drives that are not here are left out."""
     out: Path = Path("out/eval/benchmark-anchors.json")
     """The file to write."""
 

@@ -114,7 +114,7 @@ class BenchmarkDrive:
 
 @dataclass(frozen=True)
 class Scoring:
-    """How curves are compared: see ``v1.toml``, whose values these are."""
+    """The rules by which curves are compared; ``v1.toml`` explains them."""
 
     windows_db: tuple[Window, ...]
     first_scored_frame: int
@@ -143,7 +143,7 @@ class Scoring:
 
 
 AnchorClips = Mapping[tuple[str, str], tuple[CodedClip, ...]]
-"""By the names of drive and anchor."""
+"""Curves by the names of drive and anchor."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Benchmark:
 
     @cached_property
     def anchor_clips(self) -> AnchorClips:
-        """What the anchors made of the drives.
+        """The anchors' curves on the drives.
 
         Raises ``InvalidData`` if the file is not the one that the definition names.
         """

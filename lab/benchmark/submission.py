@@ -1,4 +1,4 @@
-"""What anybody hands in to a benchmark: its format, made by a command and checked against drives.
+"""The format of a submission to the benchmark, made by a command and checked against drives.
 
 A submission is a folder::
 
@@ -30,7 +30,7 @@ from rfcore.image import I420, read_rgb
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.tables import Range, Table
 from rfedge.evaluate.clips import CodedClip, Drive, luma_mse
-from rfedge.evaluate.picture_quality import luma_ssim
+from rfedge.evaluate.ssim import luma_ssim
 from rfedge.results import as_json
 
 __all__ = [

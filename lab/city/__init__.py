@@ -32,7 +32,7 @@ class PlanCity:
     samples: int = 9
     """Servers that also run with the product's session machines, to check the flow model."""
     sample_s: float = 30.0
-    """For how many seconds of the virtual clock they are counted, after 20 s."""
+    """Seconds of the virtual clock for which they are counted, after 20 s."""
     out: Annotated[Path, FOLDER] = Path("out/city")
     """Folder for the city's report.html and city.json."""
     json: Annotated[str | None, arg(metavar="FILE.json|-")] = None

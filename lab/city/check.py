@@ -27,7 +27,7 @@ MOST_SAMPLES = 1000
 
 @dataclass(frozen=True)
 class CheckPlan:
-    """How many servers are sampled, and for how long each runs on the virtual clock."""
+    """The number of servers that are sampled, and the time each runs on the virtual clock."""
 
     samples: int = 9
     warm_up_s: float = 20.0

@@ -86,7 +86,7 @@ line is drawn."""
 
 @dataclass(frozen=True)
 class VehicleKind:
-    """What each vehicle sends, and how soon 99 % of its pictures have to be reconstructed."""
+    """A vehicle's demand, and the time in which 99 % of its pictures have to be reconstructed."""
 
     demand: Demand
     moving_percent: float = TABLES_MOVING_PERCENT
@@ -115,7 +115,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Admission:
-    """Whom a server lets in: the product's limits, and its most streams."""
+    """The product's limits of admission, and the most streams of a server."""
 
     limits: AdmissionLimits = field(default_factory=AdmissionLimits)
     streams: int = 256

@@ -45,7 +45,7 @@ __all__ = [
     "FIRST_FRAME_RATIO",
     "Costs",
     "Flow",
-    "Shared",
+    "SharedLoad",
     "age_samples_s",
     "answer_bytes",
     "city_flow",
@@ -67,7 +67,7 @@ LEAST_VEHICLES = 1e-9
 
 @dataclass(frozen=True)
 class Costs:
-    """What a vehicle's frames take.
+    """The costs of a vehicle's frames.
 
     ``frame_bytes``: of one camera's, on the link; ``frame_ratios``: sizes over their mean;
     ``sender_s`` and ``server_s``: processor time of either end a frame; ``unexplained_s``: what
@@ -87,17 +87,17 @@ class Costs:
 
     @property
     def bits_per_hz(self) -> float:
-        """Of one vehicle, for a picture a second of each of its cameras."""
+        """Bits of one vehicle for a picture a second of each of its cameras."""
         return 8 * self.cameras * self.frame_bytes
 
     @property
     def cores_per_hz(self) -> float:
-        """Of its server, likewise."""
+        """Cores of its server for the same pictures."""
         return self.cameras * self.server_s
 
     @property
     def path_s(self) -> float:
-        """From the beginning of coding to the answer, with nobody else there, less the time on the
+        """Time from the beginning of coding to the answer with nobody else there, without the
         uplink."""
         return self.sender_s + self.server_s + 2 * self.propagation_s
 
@@ -142,7 +142,7 @@ def answer_bytes() -> int:
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """What a block of T steps comes to, in C cells [T, C] and at S servers [T, S].
+    """The flows of a block of T steps in C cells [T, C] and at S servers [T, S].
 
     ``served`` and ``rate_hz``: vehicles let in, and pictures a second of each of their cameras;
     ``link_limited``: whether the uplink limits the rate; ``held``: whether it is below what the
@@ -271,10 +271,10 @@ def _all_busy(workers: Floats, load: Floats, own_load: Floats, cameras: int) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class Shared:
-    """What frames of R cells meet, [R] each: their cell's vehicles, rate and uplink, whether it
-    limits the rate and pictures are held back, and their server's vehicles, cores in use and
-    cores."""
+class SharedLoad:
+    """The load around frames of R cells, [R] each: their cell's vehicles, rate and uplink, whether
+    it limits the rate and pictures are held back, and their server's vehicles, cores in use
+    and cores."""
 
     vehicles: Floats
     rate_hz: Floats
@@ -286,7 +286,7 @@ class Shared:
     server_cores: Floats
 
 
-def age_samples_s(costs: Costs, shared: Shared, seed: int) -> Floats:
+def age_samples_s(costs: Costs, shared: SharedLoad, seed: int) -> Floats:
     """Return ages of pictures at their reconstruction, [R, AGE_SAMPLES] of equal weight.
 
     The same points are taken for every cell, so that a cell with more of everything has no age that
@@ -316,7 +316,7 @@ def age_samples_s(costs: Costs, shared: Shared, seed: int) -> Floats:
 class _LinkTimes:
     """Times on the uplink of each cell: columns [R, 1]."""
 
-    def __init__(self, costs: Costs, shared: Shared) -> None:
+    def __init__(self, costs: Costs, shared: SharedLoad) -> None:
         self._costs = costs
         self._vehicles = shared.vehicles[:, None]
         self._rate_hz = shared.rate_hz[:, None]
@@ -336,7 +336,7 @@ class _LinkTimes:
         return np.asarray(mixed)
 
 
-def _server_wait_s(costs: Costs, shared: Shared, chance: Floats) -> Floats:
+def _server_wait_s(costs: Costs, shared: SharedLoad, chance: Floats) -> Floats:
     cores, vehicles = shared.server_cores[:, None], shared.server_vehicles[:, None]
     others = np.maximum(vehicles - 1, 0.0)
     load = shared.server_busy[:, None] / cores * others / np.maximum(vehicles, 1.0)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lab.city.city import City, Floats
-from lab.city.flow import Costs, Flow, Shared, age_samples_s, city_flow
+from lab.city.flow import Costs, Flow, SharedLoad, age_samples_s, city_flow
 from lab.city.traffic import TrafficBlock
 from rfcore.errors import InvalidInput
 
@@ -105,7 +105,7 @@ class ServerRow:
 
 @dataclass(frozen=True)
 class LimitRow:
-    """What is asked for of ``limit``, over what there is, where and when it is most.
+    """The share of ``limit`` that is asked for, where and when it is largest.
 
     ``broken_at_s``: when it is above 1 first, None if never; ``demand_factor``: how many times the
     demand brings it to 1, None of ages, which do not grow with the demand.
@@ -195,7 +195,7 @@ def _ages_s(
     if not len(there):
         return ages_s, np.full(len(PERCENTILES), np.nan)
     server = city.cells.server[there]
-    shared = Shared(
+    shared = SharedLoad(
         vehicles=served[there],
         rate_hz=rate_hz[there],
         uplink_bps=city.cells.uplink_bps[there],

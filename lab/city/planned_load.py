@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from lab.city.city import Admission, Cells, City, Servers, VehicleKind
-from lab.city.flow import AGE_SAMPLES, Costs, Shared, age_samples_s, answer_bytes
+from lab.city.flow import AGE_SAMPLES, Costs, SharedLoad, age_samples_s, answer_bytes
 from lab.city.plan import CityPlan, plan_city
 from lab.city.traffic import TrafficBlock
 from mec_server.config import AdmissionLimits
@@ -80,7 +80,7 @@ class PlannedLoad:
 
 @dataclass(frozen=True)
 class LoadFigures:
-    """What a load takes of the server, of all uplinks, and how old its pictures get."""
+    """The cores and uplink that a load takes, and the ages of its pictures."""
 
     vehicles: int
     cores: float
@@ -178,7 +178,7 @@ def _unexplained_s(job: PlannedLoad, costs: Costs, load: LoadFigures) -> tuple[f
     return tuple((ages_s - told_s).tolist())
 
 
-def _shared(job: PlannedLoad, costs: Costs, vehicles: int) -> Shared:
+def _shared(job: PlannedLoad, costs: Costs, vehicles: int) -> SharedLoad:
     """Return what the frames of any of the vehicles meet: their own link, and all at the server."""
     values = {
         "vehicles": 1.0,
@@ -190,7 +190,7 @@ def _shared(job: PlannedLoad, costs: Costs, vehicles: int) -> Shared:
         "server_busy": vehicles * costs.hz * costs.server_s,
         "server_cores": float(job.bed.workers),
     }
-    return Shared(**{name: np.array([value]) for name, value in values.items()})
+    return SharedLoad(**{name: np.array([value]) for name, value in values.items()})
 
 
 def _unloaded_costs(job: PlannedLoad, server_s: float) -> Costs:

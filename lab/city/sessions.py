@@ -63,7 +63,7 @@ class SampledServer:
 
 @dataclass(frozen=True)
 class SessionFigures:
-    """What was counted; rates are per second of the counted time.
+    """The figures that were counted; rates are per second of the counted time.
 
     ``sent_bytes``, ``delivered_bytes`` and ``held_bytes`` are of the uplinks over the whole run.
     """
@@ -91,8 +91,8 @@ def run_sessions(
 
 
 @dataclass(frozen=True)
-class Street:
-    """What vehicles of one cell share."""
+class RadioCell:
+    """The links and the server that the vehicles of one cell share."""
 
     uplink: Pipe
     downlink: Pipe
@@ -104,10 +104,10 @@ class Street:
 class VirtualVehicle:
     """An agent with its schedule, its coder's times and its stream."""
 
-    def __init__(self, name: str, street: Street, hello: Hello, first_frame: int) -> None:
+    def __init__(self, name: str, cell: RadioCell, hello: Hello, first_frame: int) -> None:
         self.is_gone = False
-        self._name, self._street, self._hello = name, street, hello
-        self._costs, self._events = street.server.costs, street.server.events
+        self._name, self._radio_cell, self._hello = name, cell, hello
+        self._costs, self._events = cell.server.costs, cell.server.events
         self._agent = AgentSession(hello)
         self._schedule = Realtime(1 << 40, self._costs.hz, loop=True)
         self._stream: ServerStream | None = None
@@ -143,8 +143,8 @@ class VirtualVehicle:
             self.arrive()
             return
         size_bytes = min(CHUNK_BYTES, int(left_bytes) + 1)
-        size_on_link = round(size_bytes * self._street.overhead)
-        self._street.downlink.send(size_on_link, lambda: self._fetch(left_bytes - size_bytes))
+        size_on_link = round(size_bytes * self._radio_cell.overhead)
+        self._radio_cell.downlink.send(size_on_link, lambda: self._fetch(left_bytes - size_bytes))
 
     def _connect(self) -> None:
         if self.is_gone:
@@ -152,7 +152,7 @@ class VirtualVehicle:
         name = f"{self._name}/{next(self._streams)}"
         self._agent.connected(self._events.now)
         try:
-            self._stream = ServerStream(self._street.server, name, self._answer, self._refused)
+            self._stream = ServerStream(self._radio_cell.server, name, self._answer, self._refused)
         except LimitExceeded:
             self._refused()
             return
@@ -161,7 +161,7 @@ class VirtualVehicle:
     def _answer(self, data: bytes) -> None:
         """Send an answer down to this vehicle; one of an earlier stream is nobody's."""
         stream = self._stream
-        size_bytes = round(len(data) * self._street.overhead)
+        size_bytes = round(len(data) * self._radio_cell.overhead)
 
         def arrive() -> None:
             if stream is self._stream and not self.is_gone:
@@ -170,13 +170,13 @@ class VirtualVehicle:
                 self._schedule.limit(self._agent.rate_limit_hz)
                 self._pump()
 
-        self._street.downlink.send(size_bytes, arrive)
+        self._radio_cell.downlink.send(size_bytes, arrive)
 
     def _refused(self) -> None:
         """The server has no room: come again when it says."""
         self._stream = None
         self._agent.connection_lost(StreamEnd(EndReason.STREAM_LOST, "refused"), self._events.now)
-        self._events.after(self._street.retry_s, self._connect)
+        self._events.after(self._radio_cell.retry_s, self._connect)
 
     def _tick(self) -> None:
         if self.is_gone:
@@ -213,9 +213,9 @@ class VirtualVehicle:
             self._encode(job)
         stream = self._stream
         for outgoing in self._agent.messages_to_send(self._events.now):
-            size_bytes = round(len(outgoing.data) * self._street.overhead)
+            size_bytes = round(len(outgoing.data) * self._radio_cell.overhead)
             if stream is not None:
-                self._street.uplink.send(size_bytes, partial(stream.receive, outgoing.data))
+                self._radio_cell.uplink.send(size_bytes, partial(stream.receive, outgoing.data))
         self._agent.take_results()
 
     def _encode(self, job: EncodeJob) -> None:
@@ -244,7 +244,7 @@ class VirtualVehicle:
         self._frames += 1
         if job.base is None:
             ratio *= costs.first_frame_ratio
-        message_bytes = costs.frame_bytes / self._street.overhead * ratio
+        message_bytes = costs.frame_bytes / self._radio_cell.overhead * ratio
         return max(1, round(message_bytes) - HEADER_BYTES)
 
 
@@ -259,7 +259,7 @@ def _header_bytes() -> int:
 
 
 HEADER_BYTES = _header_bytes()
-"""Of a frame's message, beside its payload."""
+"""Bytes of a frame's message beside its payload."""
 
 
 class SessionRun:
@@ -274,7 +274,7 @@ class SessionRun:
         self._hello = _hello(city)
         self._costs = costs
         self._names = count()
-        self._streets = {cell: self._street(city, cell) for cell in sampled.vehicles}
+        self._radio_cells = {cell: self._radio_cell(city, cell) for cell in sampled.vehicles}
         self._vehicles: dict[int, list[VirtualVehicle]] = {cell: [] for cell in sampled.vehicles}
         for cell, vehicles in sampled.vehicles.items():
             for _ in range(vehicles):
@@ -282,9 +282,9 @@ class SessionRun:
             self._exchange(cell, sampled.entries_per_s.get(cell, 0.0))
         self.events.at(0.5, self._look)
 
-    def _street(self, city: City, cell: int) -> Street:
+    def _radio_cell(self, city: City, cell: int) -> RadioCell:
         delay_s, cells = self._costs.propagation_s, city.cells
-        return Street(
+        return RadioCell(
             uplink=Pipe(self.events, float(cells.uplink_bps[cell]), delay_s),
             downlink=Pipe(self.events, float(cells.downlink_bps[cell]), delay_s),
             server=self._server,
@@ -296,7 +296,7 @@ class SessionRun:
         first = int(self._random.integers(1 << 30))
         name = f"cav-{next(self._names)}"
         hello = replace(self._hello, vehicle_id=name)
-        vehicle = VirtualVehicle(name, self._streets[cell], hello, first)
+        vehicle = VirtualVehicle(name, self._radio_cells[cell], hello, first)
         self._vehicles[cell].append(vehicle)
         self.events.at(at_s, lambda: vehicle.arrive(fetched_bytes))
 
@@ -320,10 +320,10 @@ class SessionRun:
         self.events.after(1.0, self._look)
 
     def _delivered(self) -> tuple[int, int]:
-        streets = self._streets.values()
+        cells = self._radio_cells.values()
         return (
-            sum(street.uplink.delivered_bytes for street in streets),
-            sum(street.downlink.delivered_bytes for street in streets),
+            sum(cell.uplink.delivered_bytes for cell in cells),
+            sum(cell.downlink.delivered_bytes for cell in cells),
         )
 
     def begin_counting(self) -> None:
@@ -334,7 +334,7 @@ class SessionRun:
 
     def figures(self, counted_s: float) -> SessionFigures:
         """Return what was counted."""
-        counted, uplinks = self._server.counted, [s.uplink for s in self._streets.values()]
+        counted, uplinks = self._server.counted, [s.uplink for s in self._radio_cells.values()]
         up_bytes, down_bytes = self._delivered()
         return SessionFigures(
             served=float(np.mean(counted.served)) if counted.served else 0.0,

@@ -126,7 +126,7 @@ def _neighbour_shares(cells: Cells) -> tuple[Floats, Floats]:
 
 
 class CellMap:
-    """Which cell a point is in: the one it is nearest to in radii, if that is within ``REACH``."""
+    """Finds the cell of a point: the nearest one, in radii, if that is within ``REACH``."""
 
     def __init__(self, cells: Cells) -> None:
         self._cells = cells

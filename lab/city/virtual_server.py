@@ -28,20 +28,28 @@ from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
 from rfcore.wire.messages import Frame, Hello, StageTimes
 
-__all__ = ["DIGEST", "FIELD_ID", "Counted", "Events", "Pipe", "ServerStream", "VirtualServer"]
+__all__ = [
+    "DIGEST",
+    "FIELD_ID",
+    "Events",
+    "Pipe",
+    "ServerCounters",
+    "ServerStream",
+    "VirtualServer",
+]
 
 FIELD_ID = "ab" * 32
 DIGEST = b"d" * 16
-"""Of every render and picture: nothing is rendered or coded."""
+"""The digest of every render and picture: nothing is rendered or coded."""
 OPEN_S = 0.05
-"""From Hello to open decoders: no figure of the plan depends on it."""
+"""Time from Hello to open decoders: no figure of the plan depends on it."""
 QUEUE_BYTES = 1 << 50
 MEMORY_BYTES = 1 << 40
-"""Of every server: the plan says nothing of memory."""
+"""Memory of every server: the plan says nothing of memory."""
 
 
 class Events:
-    """What is to happen when; ``now`` is the moment of what happens."""
+    """A queue of calls by their moment; ``now`` is the moment of the call that runs."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -90,8 +98,8 @@ class Pipe:
 
 
 @dataclass
-class Counted:
-    """What is counted while ``on``; ``busy_s``: time of workers."""
+class ServerCounters:
+    """Counts while ``on``; ``busy_s``: time of workers."""
 
     on: bool = False
     ages_s: list[float] = field(default_factory=list)
@@ -106,7 +114,7 @@ class VirtualServer:
 
     def __init__(self, city: City, costs: Costs, cores: int, events: Events) -> None:
         self.events, self.costs = events, costs
-        self.counted = Counted()
+        self.counted = ServerCounters()
         admission, identity = city.admission, IdentityBudget()
         server = ServerBudget(streams=admission.streams, decoders=100_000)
         budgets = budgets_of(identity, server, cores, MEMORY_BYTES)

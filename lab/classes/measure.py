@@ -37,9 +37,9 @@ from rfedge.evaluate.clips import (
 )
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.performance import perform, seconds_left
-from rfedge.evaluate.picture_quality import luma_ssim
 from rfedge.evaluate.rivals import CodedPictures, x264_lowdelay, x264_with_our_tools
 from rfedge.evaluate.runner import Run, coded_clip, program_version
+from rfedge.evaluate.ssim import luma_ssim
 from rfedge.jobs import CellStore
 from rfedge.report.tables import Table, text_table
 from rfedge.results import Result, rows_of
@@ -73,7 +73,7 @@ LEVELS = np.array([GROUPS.index(GROUP_OF.get(label, "rest")) for label in Label]
 OURS = "rfedge"
 EQUAL_BITS, EQUAL_QUALITY = "bits", "quality"
 ROUNDING = 1e-9
-"""By how much an interpolated rate may miss the end of the curve that it was taken from."""
+"""Share by which an interpolated rate may miss the end of its curve."""
 QUICK_FRAMES = 8
 Groups = Sequence[NDArray[np.uint8]]
 """Indices into ``GROUPS`` uint8 [H, W], one array a frame."""
@@ -115,7 +115,7 @@ class PictureCoder(Protocol):
 
     @property
     def version(self) -> str:
-        """What the result depends on besides name, point and clip."""
+        """Everything that the result depends on besides name, point and clip."""
 
     def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
         """Code and decode ``frames`` with low delay."""
@@ -193,7 +193,7 @@ class ClassQuality:
     share_percent: float
     """Share of the pixels of all frames but the first."""
     equal: str
-    """What is the same for all coders: ``bits``, or ``quality`` of the whole picture."""
+    """The quantity that all coders share: ``bits``, or ``quality`` of the whole picture."""
     at_db: float
     """That quality; for equal bits, the one that our coder has for them."""
     bytes_per_frame: float
@@ -358,7 +358,7 @@ def _comparison(job: EvalClasses, given: DriveOfField) -> ClassComparison:
     ours = FieldCoder(
         render_clip(field, drive.cameras),
         f"{OURS}-{job.effort}-{field.field_id[:12]}",
-        program_version(),
+        program_version("lab/classes"),
         effort=job.effort,
     )
     rivals = (x264_with_our_tools(job.preset), x264_lowdelay(job.preset))

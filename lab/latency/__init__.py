@@ -42,8 +42,6 @@ class EvalLatency(Experiment):
     quality_db: float = 33.0
     """Luma PSNR that both are coded to."""
     out: Path = Path("out/eval/latency.json")
-    figures: Path = Path("out/eval/figures")
-    """Folder of the figures (SVG, and CSV with their numbers)."""
     cells: Path = Path("out/eval/latency")
 
     def __post_init__(self) -> None:
@@ -53,14 +51,10 @@ class EvalLatency(Experiment):
             raise InvalidInput("quality_db", f"{self.quality_db} dB is outside 20..50 dB")
 
     def run(self) -> None:
-        """Code what is not there yet, play it, write rows and figures, print what is needed."""
+        """Code what is not there yet, play it, write the rows, print what is needed."""
         from rich.console import Console
 
-        from lab.latency.report import write_latency_figures
         from lab.latency.run import run_latency
         from rfedge.arguments import field_path
 
-        console = Console()
-        result = run_latency(replace(self, field=field_path(self.field)), console)
-        for path in write_latency_figures(result, self.figures, "latency"):
-            console.print(f"  {path}")
+        run_latency(replace(self, field=field_path(self.field)), Console())

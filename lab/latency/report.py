@@ -28,7 +28,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class NeededRow:
-    """What one sender's frames need: sizes, uplink, and computing at both ends."""
+    """The needs of one sender's frames: sizes, uplink, and computing at both ends."""
 
     scene: str
     hz: float
@@ -62,7 +62,7 @@ class PlayedRow:
     tau_ms: Mapping[str, float]
     """Transmission time: mean, p50 and p99."""
     network_ms: Mapping[str, float]
-    """From sending to arrival: waiting, transmission and delay."""
+    """Time from sending to arrival: waiting, transmission and delay."""
     network_p99_ms: float | None = field(metadata=shown("p99 ms", ".2f", "never"))
     """Quantile over all frames, dropped ones among them."""
     share_within: Mapping[str, float]

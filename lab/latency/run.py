@@ -67,7 +67,7 @@ BUDGETS_MS = (5.0, 10.0)
 REQUIREMENT = 0.99999
 """Share of frames that must be so quick (the paper)."""
 SHOWN_WITHIN_MS = (50.0, 100.0, 200.0)
-"""From capture to shown."""
+"""Time from capture to shown."""
 FRAMES_FOR_REQUIREMENT = math.ceil(math.log(0.05) / math.log(REQUIREMENT))
 """Frames in time without a single late one before 99.999 % may be claimed with 95 % confidence."""
 F64 = NDArray[np.float64]
@@ -76,7 +76,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class FrameWork:
-    """What one frame takes: of the link, and of a processor at both ends."""
+    """The bytes of one frame on the link, and its processor time at both ends."""
 
     size_bytes: int
     sender_ms: float
@@ -92,7 +92,7 @@ class Latencies:
 
     @property
     def frames(self) -> int:
-        """How many frames were captured."""
+        """Number of frames that were captured."""
         return len(self.latency_ms) + self.dropped
 
     def share_within(self, budget_ms: float) -> float:
@@ -106,9 +106,9 @@ class Latencies:
 
 
 @dataclass(frozen=True)
-class Shown(Latencies):
-    """From capture to shown; ``sender_busy`` and ``receiver_busy``: for which share of the time
-    either end computed."""
+class ShownLatencies(Latencies):
+    """Times from capture to shown; ``sender_busy`` and ``receiver_busy``: the share of the time for
+    which either end computed."""
 
     sender_busy: float
     receiver_busy: float
@@ -126,7 +126,7 @@ class Played(Latencies):
         return self.latency_ms
 
 
-def show(frames: Sequence[FrameWork], rate_hz: float, link: DirectionPlan) -> Shown:
+def show(frames: Sequence[FrameWork], rate_hz: float, link: DirectionPlan) -> ShownLatencies:
     """Capture a frame every ``1 / rate_hz`` seconds, send what can be sent over ``link``, show it.
 
     ``frames`` must not be empty.
@@ -134,7 +134,7 @@ def show(frames: Sequence[FrameWork], rate_hz: float, link: DirectionPlan) -> Sh
     machine = link.unbounded().link()
     answer_s = link.profile.delay_s
     heard_s = [0.0] * WINDOW
-    """When the vehicle heard of each frame it sent, in the order of sending."""
+    """Time at which the vehicle heard of each frame it sent, in the order of sending."""
     sender_free_s = receiver_free_s = 0.0
     latency_ms: list[float] = []
     sent: list[FrameWork] = []
@@ -152,7 +152,7 @@ def show(frames: Sequence[FrameWork], rate_hz: float, link: DirectionPlan) -> Sh
         sent.append(work)
         next_frame = newest + 1
     lasted_ms = 1e3 * max(receiver_free_s, len(frames) / rate_hz)
-    return Shown(
+    return ShownLatencies(
         np.array(latency_ms),
         len(frames) - len(sent),
         sum(work.sender_ms for work in sent) / lasted_ms,
@@ -287,7 +287,9 @@ def _links(traces: Sequence[Path]) -> Iterator[tuple[str, DirectionPlan]]:
 def _senders(job: EvalLatency, name: DriveName, field: RadianceField, run: Run) -> Iterator[Sender]:
     drive = read_drive(name, QUICK_FRAMES if job.quick else None)
     rendered, clip = render_clip(field, drive.cameras), drive.clip()
-    ours = FieldCoder(rendered, f"rfedge-{job.effort}", program_version(), effort=job.effort)
+    ours = FieldCoder(
+        rendered, f"rfedge-{job.effort}", program_version("lab/latency"), effort=job.effort
+    )
     coded = at_quality(clip, ours, job.quality_db, run.store)
     stages, ends_ms = _own_times(job, drive, field, coded.point)
     yield Sender(clip, ours.name, coded, stages, _work(coded, ends_ms))

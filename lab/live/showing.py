@@ -129,7 +129,7 @@ LOADED = (
 
 
 @dataclass(frozen=True)
-class Seen:
+class PageMeasurement:
     """Measurements of a page: ages of pictures when shown, and the time of its street's last
     drawing."""
 
@@ -154,14 +154,14 @@ class Page:
                 drawing_s = time.monotonic()
             time.sleep(POLL_S)
 
-    def watch(self, seconds: float) -> Seen:
+    def watch(self, seconds: float) -> PageMeasurement:
         """Return the page's figures over the next ``seconds``."""
         take = "const t = window.twin; const a = t.state.ages; t.state.ages = [];"
         self._driver.execute_script(take)
         time.sleep(seconds)
         ages_ms = self._driver.execute_script(take + " return a")
         drawing_ms = self._driver.execute_script("return window.twin.street.drawingMs")
-        return Seen(tuple(map(float, ages_ms)), float(drawing_ms))
+        return PageMeasurement(tuple(map(float, ages_ms)), float(drawing_ms))
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What errors of measured poses cost in bits: the second kind of rows of ``rfedge-lab localise``.
+"""Measures the bits that errors of poses cost: the second kind of rows of ``rfedge-lab localise``.
 
 A drive is coded at poses that the tracker found, from a sensor with errors, and at the dataset's
 own poses; compared at equal luma PSNR: the mean difference of log(bits) over the qualities both
@@ -34,7 +34,7 @@ __all__ = ["bits_row", "sensors_of", "tracking_times"]
 OFFICIAL = "official"
 """The pose error of a drive's ``feed``."""
 OFFICIAL_SD_M, OFFICIAL_SD_DEG = 0.75, 1.0
-"""As good as the poses of a feed of ``map`` and ``feed_map`` are taken to be."""
+"""Standard deviation assumed of the poses of a feed of ``map`` and ``feed_map``."""
 TRACKED = 13
 """Pictures whose tracking is timed for rows of starts."""
 

@@ -59,7 +59,7 @@ class WantedRow:
             "drive": _drive_digest(self.given),
             **own,
             **(starts if self.start is not None else bits),
-            "program": program_version(),
+            "program": program_version("lab/localisation"),
         }
 
     def rows(self) -> Rows:

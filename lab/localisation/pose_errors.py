@@ -1,4 +1,4 @@
-"""How a vehicle's own poses are wrong: white noise, constant offset, GNSS; one model for all uses.
+"""Models of errors of a vehicle's own poses: white noise, constant offset, GNSS.
 
 A sensor observes the true pose at instants of its own, adds its errors, and hands each observation
 over some time later. Three errors add up:
@@ -63,7 +63,7 @@ class PoseErrorModel:
     rate_hz: float = 0.0
     """Observations a second; 0: one at each true pose."""
     latency_s: float = 0.0
-    """From the instant observed until the observation is handed over."""
+    """Time from the observed instant until the observation is handed over."""
     silent_from_s: float = 0.0
     """Nothing is observed from so long after the first pose on,"""
     silent_s: float = 0.0

@@ -42,7 +42,7 @@ KNOTS = 3600 / 1852
 
 @dataclass(frozen=True)
 class FeedPlan:
-    """What to write. ``start_s``: Unix time of the first picture; ``anchor``: of the tile."""
+    """Settings of a feed. ``start_s``: Unix time of the first picture; ``anchor``: of the tile."""
 
     form: FeedForm
     errors: PoseErrorModel

@@ -36,7 +36,7 @@ class LocaliseRow:
 
 @dataclass(frozen=True)
 class BitsRow:
-    """What a sensor's errors cost on one drive."""
+    """The bits that a sensor's errors cost on one drive."""
 
     drive: str
     pose_error: str

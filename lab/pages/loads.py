@@ -117,7 +117,7 @@ def _load_bars(result: Result) -> Iterator[tuple[str, float]]:
 
 @dataclass(frozen=True)
 class LimitRow:
-    """How many vehicles the code of a revision held, run by run, and what one costs its server."""
+    """The vehicles that the code of a revision held, run by run, and the cost of one."""
 
     code: str
     vehicles: tuple[int, ...]

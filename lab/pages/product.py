@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lab.pages.ladder import ladder_parts, write_ladder_figure
 from lab.report import Draw, Report, bars, folded
 from rfcore.errors import InvalidInput
 from rfedge.demo.report import METRIC, SUMMARY, figures_of
@@ -20,7 +21,6 @@ from rfedge.evaluate.compare.rows import (
     of_first_window,
     without_field,
 )
-from rfedge.evaluate.ladder.rows import ladder_parts, write_ladder_figure
 from rfedge.evaluate.never_worse.measure import NeverWorseRow, never_worse_parts
 from rfedge.report.tables import Column, Table, named_columns, text_table
 from rfedge.results import Result, rows_of

@@ -24,7 +24,7 @@ HOLDS = Column("holds", lambda row: "yes" if row.held else "**no**")
 
 
 class LinkCell(TypedDict):
-    """What came of pictures behind a link with loss, delay and a limited rate."""
+    """The pictures of a vehicle behind a link with loss, delay and a limited rate."""
 
     loss_percent: float
     rtt_ms: float
@@ -231,7 +231,7 @@ class AttackRow:
     test: str | None = None
     """The case of ``tests/attack`` that measured it."""
     consumer_p99_ms: float | None = field(default=None, metadata=shown("consumer p99 ms", ".0f"))
-    """From capture to a consumer that watched the bystander, in JPEG."""
+    """Time from capture to a consumer that watched the bystander, in JPEG."""
     newcomer_s: float | None = field(default=None, metadata=shown("newcomer s", ".2f"))
     """Time of the slowest vehicle that came meanwhile, from its first packet to its first picture
     shown; None if one was never shown, or none came."""

@@ -28,12 +28,12 @@ class EvalPaper(Experiment):
     """Sizes that render and camera are reduced to, and rendered at."""
     out: Path = Path("out/eval/paper.json")
     figures: Path = Path("out/eval/figures")
-    """Folder of the figures (SVG, and CSV with their numbers)."""
+    """Folder of the picture that shows the fields beside the camera (SVG)."""
     cells: Path = Path("out/eval/paper")
     every: int = 1
     """Take each so many-th frame of a drive; neighbours at 10 Hz show almost the same."""
     processes: int = 1
-    """How many processes code at once; the rows do not depend on it."""
+    """Number of processes that code at once; the rows do not depend on it."""
 
     def __post_init__(self) -> None:
         from rfedge.jobs import check_processes
@@ -51,13 +51,13 @@ class EvalPaper(Experiment):
         return [parse_size(size) for size in self.sizes]
 
     def run(self) -> None:
-        """Run what is not there yet, write rows and figures, print the means."""
+        """Run what is not there yet, write the rows and the picture, print the means."""
         from rich.console import Console
 
-        from lab.paper.figures import write_paper_figures, write_views
+        from lab.paper.figures import write_views
         from lab.paper.run import run_paper, views_of
 
         console = Console()
-        written = write_paper_figures(run_paper(self, console), self.figures, "paper")
-        for path in [*written, *write_views(views_of(self), self.figures)]:
+        run_paper(self, console)
+        for path in write_views(views_of(self), self.figures):
             console.print(f"  {path}")

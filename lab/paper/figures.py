@@ -15,11 +15,11 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from lab.paper.render_quality import BANDS
 from lab.paper.report import PaperRow, means_of, paper_parts, paper_rows, savings_by_frame
 from lab.report import Report
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
-from rfedge.evaluate.picture_quality import BANDS
 from rfedge.report.charts import LINES, MARKERS, STYLE, write_figure
 from rfedge.results import Result
 
@@ -64,7 +64,7 @@ PUBLISHED_FIGURES = {
     for kind in kinds
     for column, field in enumerate(("ingp", "3dgs"))
 }
-"""By kind of scene (what follows the last hyphen of its name) and field."""
+"""The published number by kind of scene (the end of its name, after a hyphen) and field."""
 
 
 def write_paper_figures(result: Result, folder: Path, _name: str) -> list[Path]:

@@ -1,4 +1,4 @@
-"""What the rows of the published experiment say: means, savings frame by frame, and tables.
+"""Means, savings frame by frame and tables of the rows of the published experiment.
 
 The savings of a frame are its mean over presets and rate factors; spreads are over frames. Beside
 the published metric, which compares pictures of two contents and qualities, stands what a P picture

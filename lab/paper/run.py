@@ -26,6 +26,13 @@ import numpy as np
 from rich.console import Console
 
 from lab.paper import EvalPaper
+from lab.paper.render_quality import (
+    BANDS,
+    RenderQuality,
+    colour_ssim,
+    flip,
+    render_quality,
+)
 from lab.paper.report import PaperRow, paper_parts, paper_tables
 from rfcore.camera import Camera, Pose
 from rfcore.codec.h264.config import CodecConfig, effort_of_preset
@@ -39,13 +46,6 @@ from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.views import PosedPicture
 from rfedge.arguments import open_field
-from rfedge.evaluate.picture_quality import (
-    BANDS,
-    RenderQuality,
-    colour_ssim,
-    flip,
-    render_quality,
-)
 from rfedge.evaluate.runner import Run, program_version
 from rfedge.evaluate.savings import (
     intra_alone,
@@ -311,7 +311,7 @@ def _key(shot: Shot) -> dict[str, str | float | int | None]:
         "width": shot.size_px[0],
         "height": shot.size_px[1],
         "controlled": shot.controlled,
-        "program": program_version(),
+        "program": program_version("lab/paper"),
     }
 
 

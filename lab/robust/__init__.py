@@ -41,17 +41,15 @@ class EvalRobust(Experiment):
     quality_db: float = 33.0
     """Luma PSNR at which bits are compared where nothing is lost."""
     frames: int = 36
-    """How many frames of the drive."""
+    """Number of frames of the drive."""
     seeds: int = 1
-    """How many seeds of loss: means, and their 95 % intervals."""
+    """Number of seeds of loss, for means and their 95 % intervals."""
     rtts_ms: tuple[float, ...] = (20.0, 50.0, 100.0)
     """Round trips of the lossy link."""
     out: Path = Path("out/eval/robust.json")
-    figures: Path = Path("out/eval/figures")
-    """Folder of the figure (SVG, and CSV with its numbers)."""
     cells: Path = Path("out/eval/robust")
     processes: int = 1
-    """How many processes send at once; the rows do not depend on it."""
+    """Number of processes that send at once; the rows do not depend on it."""
 
     def __post_init__(self) -> None:
         from rfedge.jobs import check_processes
@@ -67,14 +65,10 @@ class EvalRobust(Experiment):
             raise InvalidInput("rtts_ms", f"{self.rtts_ms} must be some of 0..10,000 ms")
 
     def run(self) -> None:
-        """Do what is not done yet, write rows and figure, print what came out."""
+        """Do what is not done yet, write the rows, print what came out."""
         from rich.console import Console
 
-        from lab.robust.report import write_robust_figure
         from lab.robust.run import run_robust
         from rfedge.arguments import field_path
 
-        console = Console()
-        result = run_robust(replace(self, field=field_path(self.field)), console)
-        for path in write_robust_figure(result, self.figures, "robust"):
-            console.print(f"  {path}")
+        run_robust(replace(self, field=field_path(self.field)), Console())

@@ -53,7 +53,7 @@ __all__ = [
 
 
 DATAGRAM_BYTES = 1200
-"""What passes every network without fragments (RFC 9000, 14)."""
+"""A datagram of this size passes every network without fragments (RFC 9000, 14)."""
 
 KEPT = 8
 """Coded frames that are kept, for each frame of the clip."""
@@ -96,7 +96,7 @@ class Lossy:
 
 
 class Policy(StrEnum):
-    """Which earlier frame a sender predicts from."""
+    """A sender's choice of the earlier frame to predict from."""
 
     LAST_SENT = "last-sent"
     """The one before, as if it had arrived; after bad news the last one known to have."""
@@ -108,7 +108,7 @@ class Policy(StrEnum):
 
 @dataclass
 class Feedback:
-    """What a sender knows at ``frame / rate_hz`` seconds of the frames before ``frame``."""
+    """A sender's knowledge at ``frame / rate_hz`` seconds of the frames before ``frame``."""
 
     rate_hz: float
     rtt_s: float
@@ -207,7 +207,7 @@ class FrameCoder:
 
     @property
     def header(self) -> StreamHeader:
-        """What the receiver needs first."""
+        """The earlier frames that the receiver needs first."""
         return self._encoder.header
 
     def code(self, index: int, past: Past | None, *, render_only: bool) -> Encoded:

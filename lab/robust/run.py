@@ -78,7 +78,7 @@ NOISES = (
     PoseNoise(0.1, 0.1),
     PoseNoise(0.2, 0.5),
 )
-"""From none to what a receiver of satellites alone gives."""
+"""Errors from none to those of a receiver of satellites alone."""
 
 
 def noisy_cameras(cameras: Sequence[Camera], noise: PoseNoise, seed: int) -> list[Camera]:
@@ -252,7 +252,7 @@ class Bench:
             "hz": rate_hz,
             "effort": self.job.effort,
             "preset": self.job.preset,
-            "program": program_version(),
+            "program": program_version("lab/robust"),
         }
         (row,) = self.store.rows(key, lambda: [self._outcome(method, crossing)])
         (crossed,) = rows_of(CrossingRow, [{**facts, **row}])
@@ -337,7 +337,7 @@ class Bench:
         coder = FieldCoder(
             render_clip(self.field, cameras),
             f"rfedge-{self.job.effort}-{self.field.field_id}",
-            program_version(),
+            program_version("lab/robust"),
             effort=self.job.effort,
             photometric=photometric,
             points=DISTURBED_CRFS,

@@ -24,11 +24,11 @@ class EvalScale:
     """
 
     vehicles: int = 12
-    """How many stream through Envoy."""
+    """Number of vehicles that stream through Envoy."""
     servers: int = 3
-    """How many servers there are to begin with, at least two."""
+    """Number of servers at the beginning, at least two."""
     rounds: int = 5
-    """In each a server is killed, one added, one drained, and one added."""
+    """Number of rounds: in each a server is killed, one added, one drained, and one added."""
     hz: float = 2.0
     """Pictures per second of each vehicle."""
     size: str | None = "160x90"
@@ -46,7 +46,7 @@ class EvalScale:
     planned_warm_up_s: float = 5.0
     """Seconds before they are counted."""
     planned_runs: int = 3
-    """How often each of these loads is run; the medians count."""
+    """Number of runs of each of these loads; the medians count."""
     envoy: bool = True
     """Run the cases behind Envoy; --no-envoy: only what else is asked for."""
     moves: bool = True

@@ -65,7 +65,7 @@ class RayTiles:
 
 @dataclass(frozen=True)
 class Measured:
-    """What a group of cases measured."""
+    """The measurements of a group of cases."""
 
     rows: Sequence[ScaleRow]
     planning: Sequence[PlannedRow] = ()

@@ -60,7 +60,7 @@ def envoy_binary() -> Path:
 
 @dataclass(frozen=True)
 class EnvoySetup:
-    """What Envoy is started with: its command, a configuration, and a folder to run in.
+    """The command and configuration that Envoy is started with, and a folder to run in.
 
     ``port``: where it listens on 127.0.0.1; 0 takes a free one. ``groups``: the clusters
     of the configuration besides ``mec_servers``, whose servers are listed before it starts.
@@ -253,7 +253,7 @@ class ServerGroup:
 
     @property
     def addresses(self) -> list[str]:
-        """Where the servers listen."""
+        """The addresses of the servers."""
         return [server.address for server in self.servers]
 
     def start_server(self) -> Service:

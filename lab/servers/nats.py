@@ -30,9 +30,9 @@ __all__ = ["NatsServer", "nats_binary", "nats_rows", "undisturbed"]
 
 BACK_S = 2.0
 WAY_TIMES, WAY_MORE_MS = 1.2, 10.0
-"""How much longer a frame may take from sending to Ack than before: times, and added to that."""
+"""A frame may take this many times as long from sending to Ack as before, and so much more."""
 AWAY_S = 2.0
-"""How long NATS is away before it is started again."""
+"""Time for which NATS is away before it is started again."""
 START_S = 30.0
 WAIT_S = 60.0
 POLL_S = 0.01
@@ -74,7 +74,7 @@ class NatsServer:
 
     @property
     def url(self) -> str:
-        """Where it listens."""
+        """Its address."""
         return f"nats://127.0.0.1:{self._port}"
 
     def start(self) -> None:
@@ -116,8 +116,8 @@ class NatsServer:
 
 
 @dataclass
-class _Watched:
-    """When the newest picture of each vehicle came (monotonic), from a thread of its own."""
+class _NewestPictures:
+    """Notes in a thread when the newest picture of each vehicle came, on the monotonic clock."""
 
     pictures: NatsPictures
     newest_s: dict[str, float] = field(default_factory=dict)
@@ -189,8 +189,8 @@ def _command(job: EvalScale, name: str, url: str) -> list[str]:
     return [*command_of("mec-server"), *where, "--nats", url, "--nats-name", name]
 
 
-def _watch(stack: ExitStack, url: str) -> _Watched:
-    watched = _Watched(NatsPictures(NatsServers((url,))))
+def _watch(stack: ExitStack, url: str) -> _NewestPictures:
+    watched = _NewestPictures(NatsPictures(NatsServers((url,))))
     thread = threading.Thread(target=watched.run, name="watch", daemon=True)
     thread.start()
     stack.callback(thread.join, WAIT_S)
@@ -198,7 +198,7 @@ def _watch(stack: ExitStack, url: str) -> _Watched:
     return watched
 
 
-def _restart(nats: NatsServer, watched: _Watched, vehicles: int) -> float:
+def _restart(nats: NatsServer, watched: _NewestPictures, vehicles: int) -> float:
     """Kill NATS and start it again; return seconds from then until all vehicles are shown."""
     nats.kill()
     time.sleep(AWAY_S)

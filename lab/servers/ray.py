@@ -32,7 +32,7 @@ FEWEST_TILES = 3
 KILL_PERCENT = 50
 """A worker is killed once it has told of so much of its tile."""
 CHECKPOINTS = 10
-"""In the training of a tile, evenly spread."""
+"""Number of checkpoints in the training of a tile."""
 PROGRESS = re.compile(r"(\S+), process (\d+): +(\d+)%")
 RESUMED = re.compile(r"(\S+), process (\d+): going on after iteration ([\d,]+)")
 ENDED = re.compile(r"(\S+), process \d+: ended after ([0-9.]+) s")
@@ -41,27 +41,27 @@ REACHED = re.compile(r"Ray at \S+: (\d+) cores")
 
 @dataclass(frozen=True)
 class TileRun:
-    """What a run of ``rfedge train`` told, and when."""
+    """The output of a run of ``rfedge train``."""
 
     lines: tuple[str, ...]
     times_s: tuple[float, ...]
-    """When each line came, on the monotonic clock."""
+    """Time of each line on the monotonic clock."""
     killed: int
     """Workers that were killed on the way."""
 
     @property
     def cores(self) -> int:
-        """Of the Ray; raises ``RfedgeError`` for a run without one."""
+        """Cores of the Ray; raises ``RfedgeError`` for a run without one."""
         return int(self._reached()[1])
 
     @property
     def work_s(self) -> tuple[float, ...]:
-        """What each tile took in its worker, in the order they ended."""
+        """Seconds of each tile in its worker, in the order they ended."""
         return tuple(float(found[2]) for found in map(ENDED.match, self.lines) if found)
 
     @property
     def seconds(self) -> float:
-        """From when Ray was reached to the end of the last tile."""
+        """Seconds from the moment Ray was reached to the end of the last tile."""
         last = max(i for i, line in enumerate(self.lines) if ENDED.match(line))
         return self.times_s[last] - self.times_s[self.lines.index(self._reached().string)]
 

@@ -174,7 +174,7 @@ def _bound(figure: str) -> float:
 
 @dataclass
 class Rounds:
-    """What all rounds came to, and how many frames were lost by draining."""
+    """Figures of all rounds."""
 
     over_mean: list[float] = field(default_factory=list)
     after_adding: list[float] = field(default_factory=list)

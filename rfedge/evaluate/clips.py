@@ -1,4 +1,4 @@
-"""What experiments code: drives, clips of them, and a clip as some codec coded it.
+"""The material of experiments: drives, clips of them, and a clip as some codec coded it.
 
 A ``Drive`` is a data set in time order, named with its rate on the command line (``NAME@HZ=
 DATASET``, with ``,noise=SIGMA`` for frames of a noisy camera) and read once. A ``Clip`` is what a
@@ -52,7 +52,7 @@ STEADY = slice(1, None)
 
 @dataclass(frozen=True)
 class CodedClip:
-    """What coding a clip at one operating point gave, a value per frame in time order.
+    """A clip coded at one operating point, a value per frame in time order.
 
     ``frame_bytes`` int64 [N], all that would have to be sent for the frame; ``luma_mse`` float64
     [N], of the decoded luma against the camera's on the true size; ``ssim`` float64 [N], likewise;
@@ -65,7 +65,7 @@ class CodedClip:
     ssim: NDArray[np.float64]
     cpu_ms: float
     notes: Mapping[str, tuple[float | str, ...]] = field(default_factory=dict)
-    """What the method wants to tell of each frame, by name: references chosen, bits by kind..."""
+    """Notes of the method on each frame, by name: references chosen, bits by kind..."""
     receiver_cpu_ms: float | None = None
     """Processor time of the receiver over the whole clip; None if the method does not tell."""
 
@@ -103,7 +103,7 @@ class ClipCoder(Protocol):
 
     @property
     def version(self) -> str:
-        """What the result depends on besides name, point and clip."""
+        """Everything that the result depends on besides name, point and clip."""
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` with low delay: no frame may wait for a later one."""
@@ -131,7 +131,7 @@ MAX_NOISE_SIGMA = 64.0
 """Levels; nothing of a picture is left."""
 
 DECIMATION = 5
-"""Of the frames of a drive that stands for a slow camera: 10 Hz to 2."""
+"""Every so-manieth frame stands for a slow camera: 2 Hz of 10."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class Drive:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Where the frames were taken, the poses rounded as a vehicle sends them."""
+        """The cameras of the frames, the poses rounded as a vehicle sends them."""
         return [picture.camera.rounded() for picture in self.pictures]
 
     @property

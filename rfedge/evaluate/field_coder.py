@@ -31,8 +31,8 @@ from rfcore.views import FieldView
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
 from rfedge.evaluate.clips import CodedClip, luma_mse, luma_sse
-from rfedge.evaluate.picture_quality import luma_ssim
 from rfedge.evaluate.rivals import CodedPictures
+from rfedge.evaluate.ssim import luma_ssim
 from rfedge.offline import Arrival, CodedFrame, FrameInput, decode_promised, encode_frames
 
 __all__ = ["WITHOUT_FIELD", "FieldCoder", "RenderedClip", "message_bytes", "render_clip"]
@@ -41,7 +41,7 @@ LIMITS = (1.0, 51.0)
 CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
 COVERED = 0.5
 WITHOUT_FIELD: References = (Reference.PREVIOUS,)
-"""As a coder that has no field: each frame from the one before, the first by itself."""
+"""References of a coder without a field: each frame from the one before, the first alone."""
 MESSAGE_CAMERA = "front"
 MESSAGE_TIME_NS = 1_700_000_000_000_000_000
 
@@ -71,7 +71,7 @@ class RenderedClip:
 
     @property
     def digest(self) -> str:
-        """Of every picture, depth and camera: what a result depends on."""
+        """Digest of every picture, depth and camera: everything a result depends on."""
         cameras = hashlib.sha256(repr(self.cameras).encode()).hexdigest()
         arrays = ((*view.render.planes, view.depth) for view in self.views)
         return f"{_digest(chain.from_iterable(arrays))}-{cameras[:8]}"

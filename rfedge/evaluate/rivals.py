@@ -1,4 +1,4 @@
-"""What a user would pick instead: x264, x265 and SVT-AV1 set for low delay, one thread.
+"""The codecs a user would pick instead: x264, x265 and SVT-AV1 set for low delay, one thread.
 
 Each runs as a user would run it on a vehicle: every frame goes out before the next comes in (no
 reordering, no lookahead; an encoder that holds a frame back is an error), rate by CRF, one key
@@ -27,7 +27,7 @@ from rfcore.codec.h264.ffmpeg import picture_of, video_frame
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfedge.evaluate.clips import CodedClip, luma_mse
-from rfedge.evaluate.picture_quality import luma_ssim
+from rfedge.evaluate.ssim import luma_ssim
 
 __all__ = [
     "CodedPictures",
@@ -72,7 +72,7 @@ H26X_LIMITS, SVT_LIMITS = (1.0, 51.0), (1.0, 63.0)
 PROBE = I420(np.full((48, 64), 128, np.uint8), *[np.full((24, 32), 128, np.uint8)] * 2)
 PROBE_HZ, PROBE_CRF = 10.0, 30.0
 SETTINGS = re.compile(rb"x26[45] [^\0]*options: [^\0\x80]*")
-"""What x264 and x265 write about themselves into the first packet, as an SEI message."""
+"""The SEI message that x264 and x265 write about themselves into the first packet."""
 
 os.environ.setdefault("SVT_LOG", "1")  # read when the library opens: errors only
 
@@ -105,7 +105,7 @@ class Rival:
 
     @property
     def effective_options(self) -> str:
-        """What the encoder itself says that it is and does, presets and tunes resolved.
+        """The encoder's own statement of its version and settings, presets and tunes resolved.
 
         x264 and x265 write it into the stream; SVT-AV1 does not: the options as they are given.
         """
@@ -232,8 +232,8 @@ def x264_for_ssim(preset: str) -> Rival:
 
 
 OUR_TOOLS = {"mixed-refs": "1", "ref": "3", "trellis": "2", "aq-mode": "0", "psy": "0"}
-"""What our slices have at every effort: blocks that choose among three references,
-rate-distortion optimised coefficients; and what they have not."""
+"""The tools of our slices at every effort: blocks that choose among three references,
+rate-distortion optimised coefficients, no adaptive quantisation, no psychovisual terms."""
 MORE_REFERENCES = ("slow", "slower", "veryslow", "placebo")
 
 

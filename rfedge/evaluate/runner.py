@@ -1,4 +1,4 @@
-"""How every experiment runs: what is finished is taken from disk, what is measured is recorded.
+"""Runs every experiment: finished pieces are taken from disk, and results are recorded.
 
 A ``Run`` is made before anything is measured, so that the result says of which revision it is. It
 hands out finished pieces (``store``), has pieces measured in several processes or on Ray
@@ -26,7 +26,7 @@ from rfedge.results import CHECKOUT, Provenance, make_result, provenance, write_
 __all__ = ["Run", "clip_key", "coded_clip", "program_version"]
 
 PROGRAM = ("rfcore", "rfedge/evaluate", "rfedge/offline.py")
-"""Code that a finished piece depends on."""
+"""Code that every finished piece depends on."""
 
 
 @dataclass(frozen=True)
@@ -67,20 +67,21 @@ class Run:
 
 
 @cache
-def program_version(root: Path = CHECKOUT) -> str:
+def program_version(*also: str, root: Path = CHECKOUT) -> str:
     """Return the digest of the modules and kernels that a finished piece depends on.
 
-    A revision would do only in a clean checkout: it keeps its name when files change.
+    ``also`` are the folders of code that only some experiments depend on. A revision would do only
+    in a clean checkout: it keeps its name when files change.
     """
     total = hashlib.sha256()
-    for path in sorted(_program_files(root)):
+    for path in sorted(_program_files(root, also)):
         content = hashlib.sha256(path.read_bytes()).hexdigest()
         total.update(f"{path.relative_to(root)} {content}\n".encode())
     return f"program {total.hexdigest()[:16]}"
 
 
-def _program_files(root: Path) -> Iterator[Path]:
-    for name in PROGRAM:
+def _program_files(root: Path, also: Sequence[str]) -> Iterator[Path]:
+    for name in (*PROGRAM, *also):
         path = root / name
         if path.is_file():
             yield path

@@ -1,1 +1,1 @@
-"""What reports and generated pages are made of: charts, figures on disk, Markdown tables."""
+"""The parts of reports and generated pages: charts, figures on disk, tables."""

@@ -5,7 +5,7 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.metrics import ssim
-from rfedge.evaluate.picture_quality import luma_ssim
+from rfedge.evaluate.ssim import luma_ssim
 
 RNG = np.random.default_rng(4)
 SMOOTH = np.cumsum(RNG.integers(-3, 4, (64, 96)), axis=1).clip(-100, 100) + 128

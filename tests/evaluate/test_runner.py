@@ -84,22 +84,29 @@ def program(tmp_path):
     "changed", ["rfcore/codec/encoder.py", "rfcore/native/_native.so", "rfedge/evaluate/new.py"]
 )
 def test_a_changed_program_is_another_one(program, changed):
-    before = program_version.__wrapped__(program)
+    before = program_version.__wrapped__(root=program)
     (program / changed).write_bytes(b"two")
-    assert program_version.__wrapped__(program) != before
+    assert program_version.__wrapped__(root=program) != before
+
+
+def test_an_experiments_own_code_is_part_of_its_program(program):
+    before = program_version.__wrapped__("lab/paper", root=program)
+    (program / "lab/paper").mkdir(parents=True)
+    (program / "lab/paper/run.py").write_bytes(b"one")
+    assert program_version.__wrapped__("lab/paper", root=program) != before
 
 
 def test_a_program_is_not_its_documents(program):
-    before = program_version.__wrapped__(program)
+    before = program_version.__wrapped__(root=program)
     (program / "docs/page.md").write_text("new")
     (program / "rfcore/note.txt").write_text("new")
-    assert program_version.__wrapped__(program) == before
+    assert program_version.__wrapped__(root=program) == before
 
 
 def test_a_program_whose_modules_changed_places_is_another_one(program):
-    before = program_version.__wrapped__(program)
+    before = program_version.__wrapped__(root=program)
     (program / "rfcore/codec/encoder.py").rename(program / "rfcore/codec/decoder.py")
-    assert program_version.__wrapped__(program) != before
+    assert program_version.__wrapped__(root=program) != before
 
 
 def test_a_cell_that_is_forgotten_is_made_again(tmp_path):

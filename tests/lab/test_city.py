@@ -26,7 +26,7 @@ from lab.city.city import (
 from lab.city.flow import (
     AGE_SAMPLES,
     Costs,
-    Shared,
+    SharedLoad,
     age_samples_s,
     city_flow,
     costs_of,
@@ -299,14 +299,14 @@ def test_who_is_alone_waits_for_nobody() -> None:
     assert wait[0] == 0.0
 
 
-def shared(vehicles: float, **changes: float) -> Shared:
+def shared(vehicles: float, **changes: float) -> SharedLoad:
     rate_hz = changes.get("rate_hz", 10.0)
     values = {
         "vehicles": vehicles, "rate_hz": rate_hz, "uplink_bps": 80e6, "link_limited": 0.0,
         "held": 0.0, "server_vehicles": vehicles, "server_busy": vehicles * rate_hz * 0.03,
         "server_cores": 100.0,
     }  # fmt: skip
-    return Shared(**{name: np.array([value]) for name, value in (values | changes).items()})
+    return SharedLoad(**{name: np.array([value]) for name, value in (values | changes).items()})
 
 
 def test_the_age_of_a_lone_picture_is_a_sum() -> None:

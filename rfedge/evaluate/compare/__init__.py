@@ -43,7 +43,7 @@ class EvalCompare(Experiment):
     method: tuple[str, ...] = ()
     """More codecs to compare with, as package.module:Class (see docs/explanation/evaluation.md)."""
     rivals: tuple[str, ...] = ()
-    """Of the rivals these alone, by PSNR alone, as x264-our-tools-medium; x264-lowdelay-psnr, which
+    """These rivals alone, by PSNR alone, as x264-our-tools-medium; x264-lowdelay-psnr, which
     a field is paid for against, is always among them."""
     window: tuple[float, float] | None = None
     """Lowest and highest luma PSNR to compare over, in dB; 32 35 (and 30 35 where all reach it) if
@@ -51,7 +51,7 @@ class EvalCompare(Experiment):
     retime: bool = False
     """Take the processor times anew (on a quiet machine) and keep everything else."""
     processes: int = 1
-    """How many processes code at once; processor times are taken afterwards, one coder at a time,
+    """Number of processes that code at once; processor times are taken afterwards, one at a time,
     and the rows do not depend on it."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
     """Code what is not there yet on a Ray (`local` starts one here; docs/how-to/servers.md);

@@ -1,4 +1,4 @@
-"""Where the bits of a drive go, by what each macroblock of a frame shows.
+"""Splits the bits of a drive by what each macroblock of a frame shows.
 
 A pixel shows, in this order: *off-map*, where the field has nothing; *moving*, where the camera
 differs from the same drive through the empty street (parked objects count too: what is not in the
@@ -38,7 +38,7 @@ PRECEDENCE = ("off-map", "moving", "entering", "disoccluded")
 SHARE = 0.25
 NEAR_M = 0.1
 RELATIVE_DEPTH, ABSOLUTE_DEPTH_M = 0.08, 0.1
-"""How far two depths of one surface may differ; as in ``rfcore.native.warp``."""
+"""Two depths of one surface may differ by this much; as in ``rfcore.native.warp``."""
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -143,7 +143,7 @@ def _split_frames(clip: SplitClip) -> Iterator[tuple[F64, F64]]:
 
 @dataclass(frozen=True)
 class _Coding:
-    """What a frame is coded with, apart from the frame itself."""
+    """The inputs of a frame's coding beside the frame itself."""
 
     encoder: DeltaEncoder
     state: EncoderState

@@ -1,4 +1,4 @@
-"""What a comparison codes on each drive: our codec, families of rival settings, a user's codecs.
+"""The coders of a comparison on each drive: ours, families of rival settings, a user's.
 
 Drives are read and rendered, and users' codecs loaded, before anything is coded.
 """
@@ -173,7 +173,7 @@ QUICK_FRAMES = 8
 
 @dataclass(frozen=True)
 class Method:
-    """How our coder codes a drive; None leaves references to the encoder, the effort to the job."""
+    """Settings of our coder; None leaves references to the encoder, the effort to the job."""
 
     references: References | None = None
     effort: str | None = None

@@ -24,9 +24,9 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfedge.evaluate.clips import STEADY, Clip, CodedClip, luma_mse, luma_sse, psnr_of_mse
 from rfedge.evaluate.compare.rows import ForegroundRow
-from rfedge.evaluate.picture_quality import luma_ssim
 from rfedge.evaluate.rate_curve import RateCurve, bd_rate_percent
 from rfedge.evaluate.rivals import Rival, x264_for_psnr
+from rfedge.evaluate.ssim import luma_ssim
 
 __all__ = ["ForegroundCoder", "by_macroblock", "composed", "foreground_mask", "foreground_row"]
 
@@ -69,7 +69,7 @@ class ForegroundCoder:
     renders: Sequence[I420]
     rival: Rival
     stamp: str
-    """What the result depends on besides the rival's options: the field, the background, ours."""
+    """Digest of the field, the background and our coder, besides the rival's options."""
 
     @property
     def version(self) -> str:

@@ -117,7 +117,7 @@ class SsimRow:
 
 @dataclass(frozen=True)
 class BreakEvenRow:
-    """What the field's own bytes leave of the saving when a drive is driven again and again."""
+    """The saving that the field's own bytes leave when a drive is driven again and again."""
 
     scene: str
     hz: float
@@ -136,7 +136,7 @@ class BreakEvenRow:
 
 @dataclass(frozen=True)
 class BitShareRow:
-    """How much of the picture, and of the bytes, one kind of macroblock takes at one CRF."""
+    """The share of the picture and of the bytes of one kind of macroblock at one CRF."""
 
     scene: str
     hz: float

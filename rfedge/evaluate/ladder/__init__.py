@@ -30,10 +30,8 @@ class EvalLadder(Experiment):
     drive: Path = sample_path("street/transforms_drive_vehicles.json")
     """The drive to code."""
     frames: int = 24
-    """How many of its pictures."""
+    """Number of its pictures."""
     out: Path = Path("out/eval/ladder.json")
-    figures: Path = Path("out/eval/figures")
-    """Folder of the figure (SVG, and CSV with its numbers)."""
     cells: Path = Path("out/eval/ladder")
 
     def __post_init__(self) -> None:
@@ -44,15 +42,11 @@ class EvalLadder(Experiment):
             raise InvalidInput("frames", f"{self.frames} must be at least {LEAST_FRAMES}")
 
     def run(self) -> None:
-        """Measure what is not there yet, write rows and figure, print the front."""
+        """Measure what is not there yet, write the rows, print the front."""
         from rich.console import Console
 
         from rfedge.arguments import field_path
-        from rfedge.evaluate.ladder.rows import write_ladder_figure
         from rfedge.evaluate.ladder.run import run_ladder
 
-        console = Console()
         job = replace(self, fields=tuple(field_path(name) for name in self.fields))
-        result = run_ladder(job, console)
-        for path in write_ladder_figure(result, self.figures, "ladder"):
-            console.print(f"  {path}")
+        run_ladder(job, Console())

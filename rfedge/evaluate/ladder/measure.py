@@ -202,7 +202,7 @@ def _cpu(stages: Mapping[str, tuple[float, float]]) -> dict[str, float]:
 
 
 UNSTEADY_FRAMES = 2
-"""Of the first frames the motion is not known."""
+"""Frames at the beginning of which the motion is not known."""
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ class NeverWorseRow:
     first_frame_bytes: int
     rival_first_frame_bytes: int
     references: str = field(metadata=shown("mostly predicted from"))
-    """What most frames were predicted from."""
+    """The picture that most frames were predicted from."""
     cpu_ms: float
     rival_cpu_ms: float
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rfedge.evaluate.picture_quality import (
+from lab.paper.render_quality import (
     BANDS,
     colour_ssim,
     flip,
