@@ -12,7 +12,7 @@ from enum import StrEnum
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.wire.checks import check_field_id, check_label, check_name, check_range
 from rfcore.wire.v1 import edge_pb2 as pb
-from rfcore.wire.values import same_named
+from rfcore.wire.values import motion_from_wire, motion_to_wire, same_named
 
 __all__ = [
     "NOTICE_KINDS",
@@ -150,15 +150,9 @@ def _subject_from_wire(message: pb.StreetNotice) -> Subject | None:
 
 
 def _object_to_wire(ahead: ObjectAhead) -> pb.ObjectAhead:
-    (x_m, y_m, z_m), (vx, vy, vz) = ahead.at_m, ahead.velocity_mps
     return pb.ObjectAhead(
         field_id=ahead.field_id,
-        x_m=x_m,
-        y_m=y_m,
-        z_m=z_m,
-        velocity_x_mps=vx,
-        velocity_y_mps=vy,
-        velocity_z_mps=vz,
+        **motion_to_wire(ahead.at_m, ahead.velocity_mps),
         width_m=ahead.width_m,
         height_m=ahead.height_m,
         distance_m=ahead.distance_m,
@@ -171,10 +165,7 @@ def _object_to_wire(ahead: ObjectAhead) -> pb.ObjectAhead:
 
 
 def _object_from_wire(message: pb.ObjectAhead) -> ObjectAhead:
-    at_m = (message.x_m, message.y_m, message.z_m)
-    velocity_mps = (message.velocity_x_mps, message.velocity_y_mps, message.velocity_z_mps)
-    for value in (*at_m, *velocity_mps):
-        check_range("object", value, -1e9, 1e9)
+    at_m, velocity_mps = motion_from_wire(message)
     for size_m in (message.width_m, message.height_m, message.distance_m):
         check_range("object", size_m, 0.0, 1e9)
     return same_named(

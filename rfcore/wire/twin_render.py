@@ -33,6 +33,8 @@ from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.values import (
     intrinsics_from_wire,
     intrinsics_to_wire,
+    motion_from_wire,
+    motion_to_wire,
     pose_from_wire,
     pose_to_wire,
     quality_from_wire,
@@ -296,15 +298,9 @@ def objects_from_wire(response: pb.ObjectsResponse) -> ObjectsSeen:
 
 
 def _object_to_wire(each: StreetObject) -> pb.StreetObject:
-    (x_m, y_m, z_m), (vx, vy, vz) = each.at_m, each.velocity_mps
     return pb.StreetObject(
         object_id=each.object_id,
-        x_m=x_m,
-        y_m=y_m,
-        z_m=z_m,
-        velocity_x_mps=vx,
-        velocity_y_mps=vy,
-        velocity_z_mps=vz,
+        **motion_to_wire(each.at_m, each.velocity_mps),
         width_m=each.width_m,
         height_m=each.height_m,
         confidence=each.confidence,
@@ -317,10 +313,9 @@ def _object_to_wire(each: StreetObject) -> pb.StreetObject:
 
 
 def _object_from_wire(each: pb.StreetObject) -> StreetObject:
-    at_m = (each.x_m, each.y_m, each.z_m)
-    velocity_mps = (each.velocity_x_mps, each.velocity_y_mps, each.velocity_z_mps)
-    for value in (*at_m, *velocity_mps, each.width_m, each.height_m):
-        check_range("object", value, -1e9, 1e9)
+    at_m, velocity_mps = motion_from_wire(each)
+    for size_m in (each.width_m, each.height_m):
+        check_range("object", size_m, -1e9, 1e9)
     return same_named(
         StreetObject,
         each,

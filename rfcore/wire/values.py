@@ -13,11 +13,12 @@ from typing import Any, Final, TypeVar, cast
 
 from google.protobuf.message import Message
 
-from rfcore.camera import Intrinsics, Pose
+from rfcore.camera import Intrinsics, Pose, Vec3
 from rfcore.codec.references import Reference, References
 from rfcore.errors import InvalidInput
 from rfcore.field.quality import Quality
 from rfcore.localise.estimate import LocalisationState
+from rfcore.wire.checks import check_range
 from rfcore.wire.v1 import edge_pb2 as pb
 
 __all__ = [
@@ -28,6 +29,8 @@ __all__ = [
     "intrinsics_to_wire",
     "localisation_from_wire",
     "localisation_to_wire",
+    "motion_from_wire",
+    "motion_to_wire",
     "pose_from_wire",
     "pose_to_wire",
     "quality_from_wire",
@@ -103,6 +106,22 @@ def quality_from_wire(quality: pb.Quality) -> Quality:
         quality.samples_per_ray or None,
         (quality.scale_percent or 100) / 100,
     )
+
+
+def motion_to_wire(at_m: Vec3, velocity_mps: Vec3) -> dict[str, float]:
+    """Return where an object is and how it moves, by the names of its message's fields."""
+    (x_m, y_m, z_m), (vx, vy, vz) = at_m, velocity_mps
+    place = {"x_m": x_m, "y_m": y_m, "z_m": z_m}
+    return place | {"velocity_x_mps": vx, "velocity_y_mps": vy, "velocity_z_mps": vz}
+
+
+def motion_from_wire(message: Any) -> tuple[Vec3, Vec3]:
+    """Return where an object is and how it moves; raise ``InvalidInput`` for impossible values."""
+    at_m = (message.x_m, message.y_m, message.z_m)
+    velocity_mps = (message.velocity_x_mps, message.velocity_y_mps, message.velocity_z_mps)
+    for value in (*at_m, *velocity_mps):
+        check_range("object", value, -1e9, 1e9)
+    return at_m, velocity_mps
 
 
 class ClockKind(StrEnum):
