@@ -1,8 +1,9 @@
-"""Short streams with a frame of every kind, and what their receiver holds before each packet."""
+"""Short streams with a frame of every kind, and the loop of a sender and its receiver."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 
@@ -13,13 +14,13 @@ from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.photometric import sent_light
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference
-from rfcore.codec.sender.encoder import LEFT_TO_THE_ENCODER, DeltaEncoder, FrameChoice
+from rfcore.codec.sender.encoder import LEFT_TO_THE_ENCODER, DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.state import DecoderState
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour
 from rfcore.views import FieldView
 
-__all__ = ["SentFrame", "SentStream", "make_adapting_stream", "make_stream"]
+__all__ = ["SentFrame", "SentStream", "exchange", "make_adapting_stream", "make_stream"]
 
 SIZE_PX = (64, 48)
 WALL_M = 10.0
@@ -68,6 +69,25 @@ class SentStream:
 
     header: StreamHeader
     frames: tuple[SentFrame, ...]
+
+
+def exchange(
+    encoder: DeltaEncoder,
+    pictures: Iterable[tuple[I420, FieldView]],
+    choices: Iterable[FrameChoice] | None = None,
+) -> list[Encoded]:
+    """Code and decode pictures in order; assert that each decodes to what the encoder promised."""
+    decoder = DeltaDecoder(encoder.header)
+    sending, receiving, made = encoder.start(1), decoder.start(1), []
+    for (frame, view), choice in zip(pictures, choices or repeat(FrameChoice()), strict=False):
+        encoded = encoder.encode(sending, frame, view, choice)
+        decoded = decoder.decode(receiving, encoded.packet, view)
+        assert decoded.frame.digest() == encoded.reconstruction.digest()
+        assert decoded.frame.size_px == frame.size_px
+        assert (encoded.packet.sequence, decoded.lost) == (len(made), 0)
+        sending, receiving = encoded.state, decoded.state
+        made.append(encoded)
+    return made
 
 
 def make_stream(size_px: tuple[int, int] = SIZE_PX) -> SentStream:

@@ -10,8 +10,7 @@ from rfcore.codec.references import Reference
 from rfcore.codec.sender import frame_costs
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
-from rfcore.codec.sender.rate import RateModel, RateTarget, bits_curve, estimated_bits
-from rfcore.errors import InvalidInput
+from rfcore.codec.sender.rate import RateModel, RateTarget
 from rfcore.image import I420
 from rfcore.native.warp import BlockCosts
 from rfcore.views import FieldView
@@ -104,24 +103,8 @@ def test_coding_a_frame_under_rate_control_computes_no_picture_twice(
     for index in range(3):
         frame, view = pair(*SIZE_PX, 2.0 * index)
         costs = FrameCosts(frame)
-        estimated_bits(costs, view.render, 23)  # as the search for a pose does
         choice = FrameChoice(crf=18.0, target=RateTarget(600, model))
         made = encoder.encode(state, frame, view, choice, costs)
         state, model = made.state, made.rate or model
     assert Reference.PREVIOUS in made.packet.references, "an earlier frame took part"
     assert len(set(calls)) == len(calls)
-
-
-def test_the_estimate_at_one_quality_is_the_curve_there(pair: PairMaker) -> None:
-    frame, view = pair(*SIZE_PX)
-    costs = FrameCosts(frame)
-    for crf in (10.0, 23.0, 40.0):
-        curve = bits_curve(costs, [view.render], crf)
-        assert estimated_bits(costs, view.render, crf) == curve.bits[0]
-
-
-@pytest.mark.parametrize("crf", [0.5, 51.5, float("nan")])
-def test_a_quality_that_x264_has_not_is_refused(pair: PairMaker, crf: float) -> None:
-    frame, view = pair(32, 32)
-    with pytest.raises(InvalidInput, match=r"crf: .* is outside 1\.\.51"):
-        estimated_bits(FrameCosts(frame), view.render, crf)

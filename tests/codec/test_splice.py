@@ -6,6 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from codec.sent_streams import exchange
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import join_nals
 from rfcore.codec.h264.config import CodecConfig, effort_of_preset
@@ -32,16 +33,7 @@ def test_the_receiver_gets_the_senders_reconstruction_on_every_frame(
     width_px: int, height_px: int, pair: PairMaker
 ) -> None:
     encoder = DeltaEncoder(CodecConfig(width_px, height_px))
-    decoder = DeltaDecoder(encoder.header)
-    sending, receiving = encoder.start(4), decoder.start(4)
-    for index in range(4):
-        frame, render = pair(width_px, height_px, 3.0 * index)
-        encoded = encoder.encode(sending, frame, render)
-        decoded = decoder.decode(receiving, encoded.packet, render)
-        sending, receiving = encoded.state, decoded.state
-        assert decoded.frame.size_px == (width_px, height_px)
-        assert decoded.frame.digest() == encoded.reconstruction.digest()
-        assert (encoded.packet.sequence, decoded.lost) == (index, 0)
+    exchange(encoder, (pair(width_px, height_px, 3.0 * index) for index in range(4)))
 
 
 @pytest.mark.parametrize(
@@ -50,11 +42,8 @@ def test_the_receiver_gets_the_senders_reconstruction_on_every_frame(
 def test_large_pictures_splice(width_px: int, height_px: int, pair: PairMaker) -> None:
     frame, render = pair(width_px, height_px)
     encoder = DeltaEncoder(CodecConfig(width_px, height_px, effort="fast"))
-    encoded = encoder.encode(encoder.start(0), frame, render)
-    decoder = DeltaDecoder(encoder.header)
-    decoded = decoder.decode(decoder.start(0), encoded.packet, render)
-    assert decoded.frame.digest() == encoded.packet.reconstruction_digest
-    assert psnr_y_db(decoded.frame, frame) > psnr_y_db(render.render, frame) + 3
+    (encoded,) = exchange(encoder, [(frame, render)])
+    assert psnr_y_db(encoded.reconstruction, frame) > psnr_y_db(render.render, frame) + 3
 
 
 CONTENTS = ["street", "black", "white", "zero", "full", "noise"]
@@ -83,13 +72,9 @@ def test_any_frame_against_any_render_splices_at_extreme_quantisers(
         "noise": lambda seed: noise(66, 50, seed),
     }
     frame, render = make[seen](1), view_of(make[rendered](2))
-    encoder = DeltaEncoder(CodecConfig(66, 50, effort, crf))
-    encoded = encoder.encode(encoder.start(0), frame, render)
-    decoder = DeltaDecoder(encoder.header)
-    decoded = decoder.decode(decoder.start(0), encoded.packet, render)
-    assert decoded.frame.digest() == encoded.reconstruction.digest()
+    (encoded,) = exchange(DeltaEncoder(CodecConfig(66, 50, effort, crf)), [(frame, render)])
     if crf == 1.0:
-        assert np.abs(decoded.frame.y.astype(int) - frame.y).mean() < 2
+        assert np.abs(encoded.reconstruction.y.astype(int) - frame.y).mean() < 2
 
 
 @pytest.mark.parametrize("crf", [18, 23, 28])
@@ -115,26 +100,15 @@ def test_the_splice_loses_less_than_a_tenth_of_a_decibel_to_what_x264_meant(
 def test_the_same_frames_give_the_same_packets(pair: PairMaker) -> None:
     def run() -> list[object]:
         encoder = DeltaEncoder(CodecConfig(160, 90))
-        state, packets = encoder.start(1), []
-        for index in range(3):
-            encoded = encoder.encode(state, *pair(160, 90, index))
-            state = encoded.state
-            packets.append(encoded.packet)
-        return [encoder.header, *packets]
+        made = exchange(encoder, (pair(160, 90, index) for index in range(3)))
+        return [encoder.header, *(encoded.packet for encoded in made)]
 
     assert run() == run()
 
 
 def test_any_receiver_takes_the_packets_of_an_encoder_of_two_threads(pair: PairMaker) -> None:
     encoder = DeltaEncoder(CodecConfig(160, 90), threads=2)
-    decoder = DeltaDecoder(encoder.header)
-    sending, receiving = encoder.start(1), decoder.start(1)
-    for index in range(3):
-        frame, render = pair(160, 90, index)
-        encoded = encoder.encode(sending, frame, render)
-        decoded = decoder.decode(receiving, encoded.packet, render)
-        sending, receiving = encoded.state, decoded.state
-        assert decoded.frame.digest() == encoded.packet.reconstruction_digest
+    exchange(encoder, (pair(160, 90, index) for index in range(3)))
     with pytest.raises(InvalidInput, match="threads: 0"):
         DeltaEncoder(CodecConfig(160, 90), threads=0)
 

@@ -36,7 +36,6 @@ __all__ = [
     "RateTarget",
     "bits_curve",
     "code_to_fit",
-    "estimated_bits",
 ]
 
 
@@ -83,14 +82,6 @@ def bits_curve(costs: FrameCosts, pictures: Sequence[I420], lowest_crf: float) -
     satd, ssd = _residual(costs, pictures)
     bits = np.array([_coded_bits(satd, ssd, crf) for crf in crfs])
     return BitsCurve(crfs, np.minimum.accumulate(LEAST_BITS + bits))
-
-
-def estimated_bits(costs: FrameCosts, picture: I420, crf: float) -> float:
-    """Estimate a frame's bits at ``crf`` when it is predicted from ``picture``.
-
-    Raises ``InvalidInput`` for a CRF outside 1..51.
-    """
-    return LEAST_BITS + _coded_bits(*_residual(costs, [picture]), crf)
 
 
 def _residual(costs: FrameCosts, pictures: Sequence[I420]) -> tuple[Array, Array]:
