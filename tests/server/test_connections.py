@@ -71,59 +71,6 @@ def is_closed(near: socket.socket) -> bool:
         return True
 
 
-@pytest.mark.parametrize(
-    ("address", "source"),
-    [
-        ("192.0.2.7", "192.0.2.7"),
-        ("::ffff:192.0.2.7", "192.0.2.7"),
-        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
-        ("2001:db8:1:2::1", "2001:db8:1:2::/64"),
-        ("fe80::1%eth0", "fe80::/64"),
-    ],
-)
-def test_an_ipv6_site_counts_as_one_address(address: str, source: str) -> None:
-    assert source_of(address) == source
-
-
-def test_the_newest_beyond_the_cap_are_cut_and_another_address_keeps_its_own(
-    listener: socket.socket,
-) -> None:
-    port = listener.getsockname()[1]
-    connections = watching(listener, 2, 0)
-    with ExitStack() as stack:
-        greedy = []
-        for _ in range(2):
-            greedy.append(connect(stack, port))
-            greedy[-1].send(b"x")
-            stack.enter_context(listener.accept()[0])
-        assert not connections.sweep(0.0), "as many as there may be"
-        for _ in range(3):
-            greedy.append(connect(stack, port))
-            greedy[-1].send(b"x")
-            stack.enter_context(listener.accept()[0])
-        modest = connect(stack, port, "127.0.0.2")
-        modest.send(b"x")
-        stack.enter_context(listener.accept()[0])
-        (cut,) = connections.sweep(0.25)
-        assert cut == ClosedConnections("127.0.0.1", Limit.ADDRESS_CONNECTIONS, 3, barred=False)
-        assert [is_closed(near) for near in greedy] == [False, False, True, True, True]
-        assert not is_closed(modest)
-
-
-def test_sweeping_leaves_no_descriptor_behind_and_touches_no_other_port(
-    listener: socket.socket,
-) -> None:
-    other = Connections(1, 0)  # of no port
-    with ExitStack() as stack:
-        nears = [connect(stack, listener.getsockname()[1]) for _ in range(3)]
-        for _ in nears:
-            stack.enter_context(listener.accept()[0])
-        before = len(descriptors())
-        assert not other.sweep(0.0)
-        assert len(descriptors()) == before
-        assert not any(map(is_closed, nears))
-
-
 def watching(listener: socket.socket, of_address: int, of_identity: int) -> Connections:
     """Return what looks after the connections to a listener."""
     made = Connections(of_address, of_identity)
@@ -157,6 +104,44 @@ class Pairs:
 def stack() -> Iterator[ExitStack]:
     with ExitStack() as made:
         yield made
+
+
+@pytest.mark.parametrize(
+    ("address", "source"),
+    [
+        ("192.0.2.7", "192.0.2.7"),
+        ("::ffff:192.0.2.7", "192.0.2.7"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("2001:db8:1:2::1", "2001:db8:1:2::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+    ],
+)
+def test_an_ipv6_site_counts_as_one_address(address: str, source: str) -> None:
+    assert source_of(address) == source
+
+
+def test_the_newest_beyond_the_cap_are_cut_and_another_address_keeps_its_own(
+    listener: socket.socket, stack: ExitStack
+) -> None:
+    connections = watching(listener, 2, 0)
+    first = Pairs(stack, listener, "127.0.0.1", 2)
+    assert not connections.sweep(0.0), "as many as there may be"
+    beyond = Pairs(stack, listener, "127.0.0.1", 3)
+    modest = Pairs(stack, listener, "127.0.0.2", 1)
+    (cut,) = connections.sweep(0.25)
+    assert cut == ClosedConnections("127.0.0.1", Limit.ADDRESS_CONNECTIONS, 3, barred=False)
+    assert all(map(is_closed, beyond.nears))
+    assert not any(map(is_closed, (*first.nears, *modest.nears)))
+
+
+def test_sweeping_leaves_no_descriptor_behind_and_touches_no_other_port(
+    listener: socket.socket, stack: ExitStack
+) -> None:
+    pairs = Pairs(stack, listener, "127.0.0.1", 3)
+    before = len(descriptors())
+    assert not Connections(1, 0).sweep(0.0)  # of no port
+    assert len(descriptors()) == before
+    assert not any(map(is_closed, pairs.nears))
 
 
 def test_bytes_that_become_no_message_end_a_connection_and_messages_do_not(
@@ -353,19 +338,20 @@ def is_ready(listener: socket.socket, within_s: float = 0.0) -> bool:
     return bool(select.select([listener], [], [], within_s)[0])
 
 
-def test_a_connection_is_accepted_when_it_says_something(listener: socket.socket) -> None:
+def test_a_connection_is_accepted_when_it_says_something(
+    listener: socket.socket, stack: ExitStack
+) -> None:
     port = listener.getsockname()[1]
-    with ExitStack() as stack:
-        connect(stack, port)
-        assert is_ready(listener)
-        stack.enter_context(listener.accept()[0])
-        assert keep_silent_out(port) == 1
-        silent, speaking = connect(stack, port), connect(stack, port)
-        assert not is_ready(listener)
-        speaking.send(b"x")
-        assert is_ready(listener, 10)
-        accepted = stack.enter_context(listener.accept()[0])
-        assert accepted.getpeername() == speaking.getsockname() != silent.getsockname()
+    connect(stack, port)
+    assert is_ready(listener)
+    stack.enter_context(listener.accept()[0])
+    assert keep_silent_out(port) == 1
+    silent, speaking = connect(stack, port), connect(stack, port)
+    assert not is_ready(listener)
+    speaking.send(b"x")
+    assert is_ready(listener, 10)
+    accepted = stack.enter_context(listener.accept()[0])
+    assert accepted.getpeername() == speaking.getsockname() != silent.getsockname()
 
 
 async def test_a_server_lets_its_kernel_keep_silent_connections(tmp_path: Path) -> None:

@@ -4,7 +4,10 @@ import asyncio
 import os
 import threading
 from collections import Counter, defaultdict
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack
 from functools import partial
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -88,196 +91,179 @@ def test_an_item_waits_for_at_most_one_item_of_each_other_owner_per_own_item(
         take()
 
 
-def test_one_frame_behind_a_hundred_of_another_owner_is_the_second_to_begin() -> None:
-    queue: FairQueue[str] = FairQueue()
-    for _ in range(100):
-        queue.put("greedy", "greedy")
-    queue.put("modest", "modest")
-    assert [queue.take() for _ in range(3)] == ["greedy", "modest", "greedy"]
-
-
 # --- workers
 
 
-def test_what_was_returned_or_raised_reaches_the_loop_that_asked() -> None:
-    async def run() -> list[int | Exception]:
-        workers, outcomes, all_here = (
-            Workers(2, unexpected),
-            list[int | Exception](),
-            asyncio.Event(),
-        )
-        here = threading.get_ident()
+MakeWorkers = Callable[..., Workers]
 
-        def done(outcome: int | Exception) -> None:
-            assert threading.get_ident() == here
-            outcomes.append(outcome)
-            if len(outcomes) == 3:
-                all_here.set()
 
-        for divisor in (1, 0, 2):
-            workers.submit("cav-1", lambda divisor=divisor: 10 // divisor, done)
-        await all_here.wait()
-        await asyncio.to_thread(workers.close)
-        return outcomes
+@pytest.fixture
+async def make_workers() -> AsyncIterator[MakeWorkers]:
+    """Make pools of threads that are closed after the test."""
+    async with AsyncExitStack() as stack:
 
-    outcomes = asyncio.run(run())
+        def make(
+            threads: int, failed: Callable[[Exception], None] = unexpected, **options: Any
+        ) -> Workers:
+            workers = Workers(threads, failed, **options)
+            stack.push_async_callback(asyncio.to_thread, workers.close)
+            return workers
+
+        yield make
+
+
+async def result_of(workers: Workers, work: Callable[[], Any]) -> Any:
+    """Do ``work`` on a thread of ``workers``."""
+    found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+    workers.submit("cav-1", work, found.set_result)
+    return await asyncio.wait_for(found, 30)
+
+
+async def test_what_was_returned_or_raised_reaches_the_loop_that_asked(
+    make_workers: MakeWorkers,
+) -> None:
+    outcomes, all_here = list[int | Exception](), asyncio.Event()
+    here = threading.get_ident()
+
+    def done(outcome: int | Exception) -> None:
+        assert threading.get_ident() == here
+        outcomes.append(outcome)
+        if len(outcomes) == 3:
+            all_here.set()
+
+    workers = make_workers(2)
+    for divisor in (1, 0, 2):
+        workers.submit("cav-1", lambda divisor=divisor: 10 // divisor, done)
+    await all_here.wait()
     assert sorted(o for o in outcomes if isinstance(o, int)) == [5, 10]
     assert [type(o) for o in outcomes if isinstance(o, Exception)] == [ZeroDivisionError]
 
 
-def test_one_worker_does_work_in_the_order_of_asking() -> None:
-    async def run() -> list[int]:
-        workers, order, last = Workers(1, unexpected), list[int](), asyncio.Event()
-        for number in range(100):
-            workers.submit("cav-1", lambda number=number: order.append(number), lambda _: None)
-        workers.submit("cav-1", lambda: None, lambda _: last.set())
-        await last.wait()
-        await asyncio.to_thread(workers.close)
-        return order
-
-    assert asyncio.run(run()) == list(range(100))
+async def test_one_worker_does_work_in_the_order_of_asking(make_workers: MakeWorkers) -> None:
+    workers, order = make_workers(1), list[int]()
+    for number in range(100):
+        workers.submit("cav-1", lambda number=number: order.append(number), lambda _: None)
+    await result_of(workers, lambda: None)
+    assert order == list(range(100))
 
 
-def test_every_thread_of_all_workers_begins_at_the_same_time() -> None:
-    async def run() -> list[str]:
-        pools = Workers(3, unexpected), Workers(1, unexpected, "background")
-        here, all_here = list[str](), threading.Barrier(4, timeout=30)
+async def test_every_thread_of_all_workers_begins_at_the_same_time(
+    make_workers: MakeWorkers,
+) -> None:
+    pools = make_workers(3), make_workers(1, name="background")
+    here, all_here = list[str](), threading.Barrier(4, timeout=30)
 
-        def work() -> None:
-            all_here.wait()
-            here.append(threading.current_thread().name)
+    def work() -> None:
+        all_here.wait()
+        here.append(threading.current_thread().name)
 
-        await on_every_thread(pools, work, 30.0)
-        for pool in pools:
-            await asyncio.to_thread(pool.close)
-        return sorted(here)
-
-    assert asyncio.run(run()) == ["background_0", "worker_0", "worker_1", "worker_2"]
+    await on_every_thread(pools, work, 30.0)
+    assert sorted(here) == ["background_0", "worker_0", "worker_1", "worker_2"]
 
 
-def test_what_one_thread_raised_is_raised() -> None:
-    async def run() -> None:
-        pool, first = Workers(2, unexpected), threading.Lock()
-        try:
-            await on_every_thread((pool,), lambda: 1 // (not first.acquire(blocking=False)), 30.0)
-        finally:
-            await asyncio.to_thread(pool.close)
-
+async def test_what_one_thread_raised_is_raised(make_workers: MakeWorkers) -> None:
+    first = threading.Lock()
     with pytest.raises(ZeroDivisionError):
-        asyncio.run(run())
-
-
-def test_threads_of_background_work_give_way_and_no_other_thread_does() -> None:
-    async def niceness(workers: Workers) -> int:
-        found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        workers.submit("cav-1", own_niceness, found.set_result)
-        try:
-            return await asyncio.wait_for(found, 30)
-        finally:
-            await asyncio.to_thread(workers.close)
-
-    def own_niceness() -> int:
-        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-
-    own = own_niceness()
-    for nice, expected in ((0, own), (4, min(19, own + 4)), (40, 19)):
-        assert (
-            asyncio.run(niceness(Workers(1, unexpected, begin=partial(give_way, nice)))) == expected
+        await on_every_thread(
+            (make_workers(2),), lambda: 1 // (not first.acquire(blocking=False)), 30.0
         )
 
 
-def test_threads_of_idle_work_are_of_the_kernels_idle_class_and_no_other_thread_is() -> None:
-    async def policy(workers: Workers) -> int:
-        found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        workers.submit("cav-1", lambda: os.sched_getscheduler(0), found.set_result)
-        try:
-            return await asyncio.wait_for(found, 30)
-        finally:
-            await asyncio.to_thread(workers.close)
-
-    own = os.sched_getscheduler(0)
-    assert asyncio.run(policy(Workers(1, unexpected))) == own
-    assert asyncio.run(policy(Workers(1, unexpected, begin=work_when_idle))) == os.SCHED_IDLE
-    assert os.sched_getscheduler(0) == own
+def own_niceness() -> int:
+    return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
 
 
-def test_while_others_come_one_owner_leaves_them_a_worker_and_all_its_work_is_done() -> None:
-    async def run() -> tuple[int, int]:
-        workers = Workers(3, unexpected, crowded=lambda: True)
-        gate, lock = threading.Event(), threading.Lock()
-        two_busy, all_ended, done = threading.Event(), asyncio.Event(), asyncio.Event()
-        busy = most = 0
-
-        def work() -> None:
-            nonlocal busy, most
-            with lock:
-                busy += 1
-                most = max(most, busy)
-                if busy == 2:
-                    two_busy.set()
-            assert gate.wait(30)
-            with lock:
-                busy -= 1
-
-        def end(outcome: object) -> None:
-            ended.append(outcome)
-            if len(ended) == 8:
-                all_ended.set()
-
-        ended: list[object] = []
-        for _ in range(8):
-            workers.submit("greedy", work, end)
-        workers.submit("modest", lambda: None, lambda _: done.set())
-        await asyncio.wait_for(done.wait(), 30)
-        assert await asyncio.to_thread(two_busy.wait, 30)
-        gate.set()
-        await asyncio.wait_for(all_ended.wait(), 30)  # closing keeps no worker back for others
-        await asyncio.to_thread(workers.close)
-        await asyncio.sleep(0)
-        return most, len(ended)
-
-    assert asyncio.run(run()) == (2, 8)
+def own_policy() -> int:
+    return os.sched_getscheduler(0)
 
 
-def test_outcomes_that_wait_together_wake_the_loop_once() -> None:
-    async def run() -> int:
-        workers, loop = Workers(1, unexpected), asyncio.get_running_loop()
-        woken, finished, last = 0, threading.Event(), asyncio.Event()
-        wake = loop.call_soon_threadsafe
+async def test_threads_of_background_work_give_way_and_no_other_thread_does(
+    make_workers: MakeWorkers,
+) -> None:
+    own = own_niceness()
+    for nice, expected in ((0, own), (4, min(19, own + 4)), (40, 19)):
+        workers = make_workers(1, begin=partial(give_way, nice))
+        assert await result_of(workers, own_niceness) == expected
+    assert own_niceness() == own
 
-        def count(*args: object) -> asyncio.Handle:
-            nonlocal woken
-            woken += 1
-            return wake(*args)
 
-        loop.call_soon_threadsafe = count
+async def test_threads_of_idle_work_are_of_the_kernels_idle_class_and_no_other_thread_is(
+    make_workers: MakeWorkers,
+) -> None:
+    own = own_policy()
+    assert await result_of(make_workers(1), own_policy) == own
+    assert await result_of(make_workers(1, begin=work_when_idle), own_policy) == os.SCHED_IDLE
+    assert own_policy() == own
+
+
+async def test_while_others_come_one_owner_leaves_them_a_worker_and_all_its_work_is_done(
+    make_workers: MakeWorkers,
+) -> None:
+    workers = make_workers(3, crowded=lambda: True)
+    gate, lock = threading.Event(), threading.Lock()
+    two_busy, all_ended = threading.Event(), asyncio.Event()
+    busy = most = 0
+
+    def work() -> None:
+        nonlocal busy, most
+        with lock:
+            busy += 1
+            most = max(most, busy)
+            if busy == 2:
+                two_busy.set()
+        assert gate.wait(30)
+        with lock:
+            busy -= 1
+
+    def end(outcome: object) -> None:
+        ended.append(outcome)
+        if len(ended) == 8:
+            all_ended.set()
+
+    ended: list[object] = []
+    for _ in range(8):
+        workers.submit("greedy", work, end)
+    await result_of(workers, lambda: None)
+    assert await asyncio.to_thread(two_busy.wait, 30)
+    gate.set()
+    await asyncio.wait_for(all_ended.wait(), 30)  # closing keeps no worker back for others
+    assert (most, ended) == (2, [None] * 8)
+
+
+async def test_outcomes_that_wait_together_wake_the_loop_once(
+    make_workers: MakeWorkers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workers, loop = make_workers(1), asyncio.get_running_loop()
+    woken, finished, last = 0, threading.Event(), asyncio.Event()
+    wake = loop.call_soon_threadsafe
+
+    def count(*args: Any) -> asyncio.Handle:
+        nonlocal woken
+        woken += 1
+        return wake(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "call_soon_threadsafe", count)
         for _ in range(10):
             workers.submit("cav-1", lambda: None, lambda _: None)
         workers.submit("cav-1", finished.set, lambda _: None)
         workers.submit("cav-1", lambda: None, lambda _: last.set())
         assert finished.wait(10), "the loop is held up, and the worker is not"
         await last.wait()
-        loop.call_soon_threadsafe = wake
-        await asyncio.to_thread(workers.close)
-        return woken
-
-    assert asyncio.run(run()) <= 2, "one for those before, perhaps one for the last"
+    assert woken <= 2, "one for those before, perhaps one for the last"
 
 
-def test_close_waits_for_what_was_asked_for() -> None:
-    async def run() -> list[int]:
-        workers, done = Workers(2, unexpected), list[int]()
-        for number in range(20):
-            workers.submit("cav-1", lambda number=number: done.append(number), lambda _: None)
-        await asyncio.to_thread(workers.close)
-        return done
-
-    assert sorted(asyncio.run(run())) == list(range(20))
+async def test_close_waits_for_what_was_asked_for() -> None:
+    workers, done = Workers(2, unexpected), list[int]()
+    for number in range(20):
+        workers.submit("cav-1", lambda number=number: done.append(number), lambda _: None)
+    await asyncio.to_thread(workers.close)
+    assert sorted(done) == list(range(20))
 
 
 async def test_workers_let_owners_take_turns() -> None:
     workers, order = Workers(1, unexpected), list[str]()
-    begun, gate, last = threading.Event(), threading.Event(), asyncio.Event()
+    begun, gate = threading.Event(), threading.Event()
 
     def hold() -> None:
         begun.set()
@@ -288,9 +274,7 @@ async def test_workers_let_owners_take_turns() -> None:
     for _ in range(5):
         workers.submit("greedy", lambda: order.append("greedy"), lambda _: None)
     workers.submit("modest", lambda: order.append("modest"), lambda _: None)
-    workers.submit("last", lambda: None, lambda _: last.set())
     gate.set()
-    await last.wait()
     await asyncio.to_thread(workers.close)
     assert order == ["greedy", "modest", "greedy", "greedy", "greedy", "greedy"]
 
