@@ -227,25 +227,22 @@ def test_text_that_is_not_rows_of_numbers_is_refused_by_name(
         read_ply(tmp_path / "b.ply")
 
 
-@pytest.mark.parametrize("suffix", ["splat", "ksplat", "sog", "SOG"])
-def test_other_formats_of_splats_are_refused_with_the_command_that_converts_them(
-    tmp_path: Path, suffix: str
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("a.splat", r"splat-transform a\.splat a\.ply$"),
+        ("a.ksplat", r"splat-transform a\.ksplat a\.ply$"),
+        ("a.SOG", r"splat-transform a\.SOG a\.ply$"),
+        ("a.sogs", r"unpack it .* splat-transform meta\.json a\.ply$"),
+        ("a.glb", r"export the splats as \.ply"),
+        ("a.gltf", r"export the splats as \.ply"),
+    ],
+)
+def test_other_formats_are_refused_with_what_converts_them(
+    tmp_path: Path, name: str, advice: str
 ) -> None:
-    with pytest.raises(FieldFormatError, match=rf"splat-transform a\.{suffix} a\.ply$"):
-        read_ply(tmp_path / f"a.{suffix}")
-
-
-def test_a_zip_of_pictures_is_refused_with_what_unpacks_and_converts_it(tmp_path: Path) -> None:
-    with pytest.raises(FieldFormatError, match=r"unpack it .* splat-transform meta\.json a\.ply$"):
-        read_ply(tmp_path / "a.sogs")
-
-
-@pytest.mark.parametrize("suffix", ["gltf", "glb"])
-def test_formats_that_nothing_converts_are_refused_all_the_same(
-    tmp_path: Path, suffix: str
-) -> None:
-    with pytest.raises(FieldFormatError, match=r"export the splats as \.ply"):
-        read_ply(tmp_path / f"a.{suffix}")
+    with pytest.raises(FieldFormatError, match=advice):
+        read_ply(tmp_path / name)
 
 
 @pytest.mark.parametrize("antialiased", [True, False, None])
@@ -293,11 +290,6 @@ def test_a_mode_there_is_not_is_refused_by_name(make_gaussians, tmp_path: Path) 
     edited(tmp_path / "a.ply", "SplatRenderMode: mip", "SplatRenderMode: 2dgs")
     with pytest.raises(FieldFormatError, match="'SplatRenderMode: 2dgs' names neither mode"):
         read_splat_file(tmp_path / "a.ply")
-
-
-def test_the_header_of_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FieldFormatError, match=r"none\.ply: cannot be read"):
-        read_splat_file(tmp_path / "none.ply")
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])

@@ -1,4 +1,4 @@
-// Binds rfcore/csrc/picture/blake2b.h. rfcore/native/yuv.py gives both messages the same sizes.
+// Binds picture/blake2b.h. rfcore/native/yuv.py makes sure that both messages have the same size.
 #include "picture/blake2b.h"
 
 #include <nanobind/nanobind.h>

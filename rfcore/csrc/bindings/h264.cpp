@@ -1,4 +1,4 @@
-// Binds rfcore/csrc/h264/slice_coder.h. rfcore/codec/h264/slice_coder.py checks values; the types
+// Binds h264/slice_coder.h. rfcore/codec/h264/slice_coder.py checks values; the types
 // below refuse anything else that nanobind can see.
 #include "h264/slice_coder.h"
 

@@ -1,4 +1,4 @@
-// Binds rfcore/csrc/yuv.h. Shapes and dtypes are checked by rfcore/native/yuv.py; the types below
+// Binds picture/yuv.h. Shapes and dtypes are checked by rfcore/native/yuv.py; the types below
 // refuse anything else that nanobind can see.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>

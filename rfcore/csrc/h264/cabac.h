@@ -16,7 +16,7 @@ struct Contexts {
     uint8_t state[kContexts];
 };
 
-// Clause 9.3.1.1. `p_slice`: cabac_init_idc is 0.
+// The states a slice starts with (9.3.1.1). `p_slice`: cabac_init_idc is 0.
 inline void init_contexts(Contexts& contexts, bool p_slice, int qp) {
     for (int i = 0; i < kContexts; ++i) {
         const int8_t* mn = kContextInit[i][p_slice];

@@ -15,8 +15,8 @@ struct Canvas {
 
 // Partitions are not tried where 16x16 is predicted this well, in bits: they would cost as much.
 constexpr uint32_t kWholeBits = 100;
-// Whether nothing is left to code is not looked for where the difference costs more than this, in
-// bits: it is left there.
+// Above this difference, in bits, something is surely left to code, so that no test for an empty
+// residual is made.
 constexpr uint32_t kSkipBits = 100;
 
 // What an I_PCM macroblock takes in 1/256 bits: samples, type, alignment and the coder's new start.

@@ -30,7 +30,7 @@ struct EdgeLimits {
     int16_t alpha, beta;
 };
 
-// 8.7.2.2 with filter offsets of 0; false where no sample can change. `qp`: the mean of both sides.
+// The thresholds of 8.7.2.2; false where no sample can change. `qp`: the mean of both sides.
 inline bool set_limits(const uint8_t* strength, int qp, EdgeLimits& edge) {
     const int index = qp - kFirstFiltered;
     if (index < 0) return false;

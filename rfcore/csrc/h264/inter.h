@@ -90,7 +90,7 @@ inline Block luma_prediction(const QuarterPlanes& planes, int x, int y, Mv mv, i
     return {scratch, 16};
 }
 
-// 8.4.2.2.2; (x, y) and sizes in chroma samples, out with stride 8.
+// The chroma prediction (8.4.2.2.2): (x, y) and sizes in chroma samples, `out` of stride 8.
 template <int width>
 void predict_chroma(const Plane& plane, int x, int y, Mv mv, int height, uint8_t* out) {
     const int fx = mv.x & 7, fy = mv.y & 7;

@@ -186,7 +186,7 @@ void predict_block(int mode, const Edge<side>& edge, const EdgeMeans<side>& mean
     }
 }
 
-// 8.3.3.4 and 8.3.4.4.
+// Plane prediction of luma (8.3.3.4) and of chroma (8.3.4.4).
 template <int side>
 void predict_plane(const uint8_t* at, ptrdiff_t stride, uint8_t* out) {
     constexpr int kHalf = side / 2;

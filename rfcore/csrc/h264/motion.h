@@ -38,7 +38,7 @@ struct MotionField {
         }
     }
 
-    // Forgets the macroblock's own blocks.
+    // Marks the macroblock's own blocks as not yet known.
     void forget() {
         for (int y = 1; y < 5; ++y) {
             for (int x = 1; x < 5; ++x) put(x, y, kUnavailable, {0, 0});
@@ -58,7 +58,7 @@ inline int16_t median(int16_t a, int16_t b, int16_t c) {
     return c < low ? low : c > high ? high : c;
 }
 
-// 8.4.1.3 without the rules for halves.
+// The median prediction (8.4.1.3), without the rules for halves.
 inline Mv median_prediction(const MotionField& f, int index, int x, int y, int width) {
     const int row = y + 1, column = x + 1;
     int cx = column + width, cy = row - 1;
@@ -84,7 +84,7 @@ inline Mv predicted_vector(const MotionField& f, int shape, const Partition& par
     return median_prediction(f, index, x, y, part.width);
 }
 
-// 8.4.1.1.
+// The vector of a skipped macroblock (8.4.1.1).
 inline Mv skip_vector(const MotionField& f) {
     const int8_t a = f.reference[1][0], b = f.reference[0][1];
     if (a == kUnavailable || b == kUnavailable) return {0, 0};

@@ -36,7 +36,7 @@ struct LumaCosts {
     Cost after[4];
 };
 
-// 8.5.12.1 and 8.5.13.1 without the DC that was transformed once more: only coded positions.
+// Dequantises coded positions (8.5.12.1, 8.5.13.1), but not a DC that was transformed twice.
 template <Category category>
 void dequantise4(const int16_t* levels, uint64_t coded, int qp, int32_t* out) {
     const Quantiser<4>& q = kQuantiser4[qp % 6];
@@ -180,7 +180,7 @@ inline void hadamard4(const int32_t* in, int32_t* out) {
     __builtin_memcpy(out, r, sizeof r);
 }
 
-// Intra16x16: the DC of the sixteen blocks apart (8.5.2, 8.5.10).
+// Intra16x16: the DC of the sixteen blocks is transformed once more (8.5.2, 8.5.10).
 inline void code_luma16(const Quality& quality, const Plane& source, const uint8_t* prediction,
                         Candidate& c) {
     const int qp = quality.qp;

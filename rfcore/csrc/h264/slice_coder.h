@@ -40,7 +40,7 @@ public:
     // Reference samples are raised to at least 1, as I_PCM pictures hold them.
     const std::vector<uint8_t>& encode(const Picture& frame, const Picture* references,
                                        int reference_count, const SliceSettings& settings);
-    // Of a macroblock of the last slice.
+    // How a macroblock of the last slice was coded.
     Mode mode(int macroblock) const { return macroblocks_[static_cast<size_t>(macroblock)].mode; }
     // What decoders make of the last slice; width and height in samples of the plane.
     void reconstruction(int plane, uint8_t* out, ptrdiff_t stride, int width, int height) const;

@@ -91,7 +91,7 @@ constexpr Quantiser<4> kQuantiserDc[6] = {
 constexpr Quantiser<8> kQuantiser8[6] = {make_quantiser8(0), make_quantiser8(1), make_quantiser8(2),
                                          make_quantiser8(3), make_quantiser8(4), make_quantiser8(5)};
 
-// Table 8-15.
+// QP_C by qP_I (Table 8-15).
 constexpr uint8_t kChromaQp[52] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12,
                                    13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25,
                                    26, 27, 28, 29, 29, 30, 31, 32, 32, 33, 34, 34, 35,

@@ -9,7 +9,7 @@ constexpr float kMaxGradient = 1e15f;
 
 RF_INLINE Mask not_zero(Lanes a) { return gt(absolute(a), zero()); }
 
-// `count` is a multiple of 16. Clears the gradients. What is not finite or beyond 1e15 counts as 0.
+// `count` is a multiple of 16. Clears the gradients; one not finite or beyond 1e15 counts as 0.
 static void adam(const AdamStep& step, size_t count, float* gradients, float* parameters,
                  float* first_moments, float* second_moments) {
     const Lanes beta1 = splat(step.beta1), beta2 = splat(step.beta2);

@@ -30,7 +30,7 @@ inline int encoded_inputs(int levels) {
     return (kFeatures * levels + kLanes - 1) / kLanes * kLanes;
 }
 size_t weight_count(int levels, int hidden);
-// Entries of the table: of a level that fits, its vertices; of the others T; in whole lanes.
+// Entries of the table: a level whose vertices fit has one for each, the others T; whole lanes.
 size_t table_entries(int levels, const int32_t* level_cells, uint32_t hashed_entries);
 
 class GridField {
@@ -60,7 +60,7 @@ class Renderer {
   public:
     Renderer(const FieldArrays& arrays, const Kernels& kernels, int threads);
 
-    // Colour [H, W, 3]; depth and opacity [H, W] both or neither; return samples evaluated.
+    // Colour [H, W, 3]; depth and opacity [H, W] both or neither; returns how many samples.
     // `samples_per_ray` 0 takes every occupied step.
     uint64_t render(const Camera& camera, int samples_per_ray, float* colour, float* depth,
                     float* opacity);

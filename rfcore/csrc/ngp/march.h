@@ -113,7 +113,7 @@ struct Filling {
 constexpr float kAtInfinity = -1.0f;  // as a step
 
 // How many occupied steps make one sample of ray r, so that `budget` samples reach to its end.
-// What is found on the way is kept in rays->windows.
+// The occupied steps found on the way are kept in rays->windows.
 template <bool kUnbounded>
 RF_INLINE int steps_per_sample(const Field& field, Rays* rays, int r, int budget) {
     uint16_t* window = rays->windows + static_cast<size_t>(r) * kMaxWindows;

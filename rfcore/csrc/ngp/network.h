@@ -57,8 +57,8 @@ struct alignas(64) Activations {
     Row raw_colour[3];
 };
 
-// 1 - exp(-t) for t >= 0, to a few roundings of itself: of a thin sample the difference would have
-// no digits left. The series is good to 5e-8 where it is used.
+// 1 - exp(-t) for t >= 0, accurate relative to itself: for a thin sample, subtracting would leave
+// no correct digit. The series is good to 5e-8 where it is used.
 RF_INLINE Lanes one_minus_exp(Lanes t) {
     const Lanes one = splat(1.0f);
     Lanes series = fma(t, splat(-1.0f / 720.0f), splat(1.0f / 120.0f));

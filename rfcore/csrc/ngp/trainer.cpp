@@ -70,7 +70,7 @@ double Trainer::accumulate(const Batch& batch) {
     return loss;
 }
 
-// Into the first block's.
+// Sums them into the first block's.
 void Trainer::sum_matrix_gradients() {
     float* sum = block_gradients_.data();
     for (int b = 1; b < blocks_; ++b) {

@@ -30,11 +30,11 @@ class Trainer {
     // Forward and backward of a batch; return the sum of squared errors. The gradients stay until
     // update() or gradients().
     double accumulate(const Batch& batch);
-    // One step of Adam, and what the samples say about the occupancy.
+    // Takes one step of Adam and notes what the samples say about the occupancy.
     void update(const Rates& rates, float peak_decay);
     // The gradients of the last accumulate(), which are forgotten.
     void gradients(float* table, float* matrices);
-    // Occupied is what has a peak above the threshold; return the number of occupied cells.
+    // Cells whose peak is above the threshold become the occupied ones; return how many.
     uint64_t rebuild_occupancy(float threshold);
 
     uint64_t samples() const { return samples_; }

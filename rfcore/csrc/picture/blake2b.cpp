@@ -20,7 +20,7 @@ constexpr int kWords = 16, kRounds = 12;
 using Pair = std::uint64_t __attribute__((vector_size(16)));
 using Pairs = std::uint64_t __attribute__((vector_size(64)));
 
-// RFC 7693, 2.6 and 2.7.
+// The constants of RFC 7693, sections 2.6 and 2.7.
 constexpr std::uint64_t kInitial[8] = {
     0x6a09e667f3bcc908, 0xbb67ae8584caa73b, 0x3c6ef372fe94f82b, 0xa54ff53a5f1d36f1,
     0x510e527fade682d1, 0x9b05688c2b3e6c1f, 0x1f83d9abfb41bd6b, 0x5be0cd19137e2179};
@@ -107,7 +107,7 @@ void compress(const Pair m[kWords], std::uint64_t counted, bool last, Pairs h[2]
             c += d;
             b ^= c;
             b = b >> 63 | b << 1;
-            // Columns to diagonals, and back; b, which the next step waits for, stays where it is.
+            // From columns to diagonals and back; b stays in place, as the next step waits for it.
             const Pairs left_a = __builtin_shufflevector(a, a, 2, 3, 4, 5, 6, 7, 0, 1);
             const Pairs right_a = __builtin_shufflevector(a, a, 6, 7, 0, 1, 2, 3, 4, 5);
             const Pairs left_c = __builtin_shufflevector(c, c, 2, 3, 4, 5, 6, 7, 0, 1);

@@ -127,7 +127,7 @@ void locate_row(const FieldPicture& view, const LiveSource& s, const RayColumns&
     }
 }
 
-// Bilinear; one channel of a difference at (left, top), (left + right, top), ...
+// Samples one channel of a difference bilinearly: at (left, top), (left + right, top), ...
 struct Corners {
     Corners(const LiveSource& s, float u, float v) {
         const int left = std::min(static_cast<int>(u), std::max(s.size.width_px - 2, 0));

@@ -33,7 +33,7 @@ struct LiveSource {
     const float* depth;
     PictureSize size;
     PinholeCamera camera;
-    // Of points in the view's axes into those of the live camera; rotation row-major.
+    // Map points from the view's axes into the live camera's; the rotation is row-major.
     float rotation[9], translation[3];
     float weight, fade;
     // Sources of one owner share one weight at each pixel.

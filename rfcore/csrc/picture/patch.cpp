@@ -15,7 +15,7 @@ inline float level(float value) {
     return (std::min(std::max(value, 0.0f), 255.0f) + kWhole) - kWhole;
 }
 
-// The four channels of `patch` at sample centre (u, v), bilinearly; nothing outside.
+// The four channels of `patch` at sample centre (u, v), bilinearly; zeros outside the patch.
 bool sample(const Patch& patch, float u, float v, float* found) {
     const int width = patch.size.width_px, height = patch.size.height_px;
     if (!(u > -1.0f && u < static_cast<float>(width) && v > -1.0f && v < static_cast<float>(height))) return false;

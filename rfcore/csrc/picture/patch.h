@@ -15,12 +15,12 @@ struct Patch {
     const float* samples;
     PictureSize size;
     PinholeCamera camera;
-    // Of points in the view's axes into those of the patch's camera; rotation row-major.
+    // Map points from the view's axes into the patch camera's; the rotation is row-major.
     float rotation[9], translation[3];
     float left, top, z_m, fade;
 };
 
-// What is drawn on. `nearest` is the depth up to which a thing is in front, and is moved there.
+// What is drawn on. `nearest` is the depth up to which a thing is in front; it is moved there.
 struct Canvas {
     std::uint8_t* rgb;
     float* depth;

@@ -129,7 +129,7 @@ void locate_row(const float* __restrict depth, const WarpGeometry& g, const Colu
     }
 }
 
-// Marks kNowhere what another surface hid in the previous picture.
+// Marks the samples that another surface hid in the previous picture as kNowhere.
 RFCORE_PER_ISA
 void drop_hidden(const float* __restrict previous_depth, int width_px, std::int32_t* __restrict u,
                  const std::int32_t* __restrict v, const float* __restrict z) {
@@ -255,7 +255,7 @@ void centre_row(const std::int32_t* top_u, const std::int32_t* bottom_u, const s
         const int a = 2 * c, b = a + 1;
         const bool known = (top_u[a] != kNowhere) & (top_u[b] != kNowhere) &
                            (bottom_u[a] != kNowhere) & (bottom_u[b] != kNowhere);
-        // Unsigned, for kNowhere may not be added to itself.
+        // Unsigned, because kNowhere added to itself would overflow.
         const auto sum = static_cast<std::uint32_t>(top_u[a]) + static_cast<std::uint32_t>(top_u[b]) +
                          static_cast<std::uint32_t>(bottom_u[a]) +
                          static_cast<std::uint32_t>(bottom_u[b]);

@@ -13,7 +13,7 @@ constexpr int kMinItemsPerPart = 2048;
 constexpr uint64_t kMaxEntries = 1ull << 28;
 constexpr int kReadableBehind = 64;  // the kernels read past the end of a list
 
-// Groups, and those that the window of a footprint at the lower right corner reaches beyond them.
+// The groups, with those beyond them that a footprint in the lower right corner may reach.
 size_t slots_of(const Camera& camera) {
     return static_cast<size_t>(camera.groups()) + static_cast<size_t>(camera.groups_x()) + 2;
 }

@@ -46,19 +46,19 @@ class Rasterizer {
     // Render colour [H, W, 3] with the first `degree` bands; with depth and opacity [H, W] both
     // or neither.
     void render(const Camera& camera, int degree, float* colour, float* depth, float* opacity);
-    // All bands.
+    // Render with all bands.
     Statistics statistics(const Camera& camera);
 
     const Kernels& kernels() const { return kernels_; }
 
   private:
-    // What one picture at a time is drawn with.
+    // The memory that one picture at a time is drawn with.
     struct Workplace {
         explicit Workplace(int threads) : pool(threads) {}
         ThreadPool pool;
         FrontEnd front_end;
     };
-    // Of all Gaussians, what drawing reads.
+    // What drawing reads of each Gaussian.
     struct Prepared {
         AlignedBuffer<float> geometry, harmonics;
     };

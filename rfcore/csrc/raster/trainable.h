@@ -23,7 +23,7 @@ class TrainableRasterizer {
     void forward(const Camera& camera, int degree, float* colour, float* depth, float* opacity);
     // L1 + D-SSIM of `colour` against `target` [H, W, 3]; keeps its gradient for backward().
     double loss(const float* colour, const float* target, float dssim_weight);
-    // The same of `affine` (exposure.h) applied to `colour`; its gradient [12] to `d_affine`.
+    // The same with `affine` (exposure.h) applied to `colour`; writes its gradient [12] too.
     double exposed_loss(const float* colour, const float* target, float dssim_weight,
                         const float* affine, double* d_affine);
     // Take a gradient [H, W, 3] instead of a loss.
@@ -38,7 +38,7 @@ class TrainableRasterizer {
     void parameters(const GaussianArrays& out_as_floats) const;
     void moments(const GaussianArrays& first_as_floats, const GaussianArrays& second_as_floats,
                  double* beta_powers) const;
-    // Go on from what moments() gave.
+    // Continue from moments that moments() returned.
     void set_moments(const GaussianArrays& first, const GaussianArrays& second,
                      const double* beta_powers);
     // Sums since the last density control: [count, kScorePlanes].
