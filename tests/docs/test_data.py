@@ -42,7 +42,7 @@ def test_the_commands_lead_from_recordings_to_a_decoded_drive(
     monkeypatch.chdir(tmp_path)
     make_recording(Path("my-street"), "transforms_drive_empty.json", with_points=True)
     make_recording(Path("my-drive"), "transforms_drive_vehicles.json", with_points=False)
-    for command in PAGE.commands("sh"):
+    for _, *command in PAGE.commands("sh"):
         small = ["96x54" if word == "640x360" else word for word in command]
         if small[0] == "train":
             small += ["--iterations", "40", "--gaussians", "2000", "--threads", "1"]
