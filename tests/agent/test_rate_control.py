@@ -119,7 +119,9 @@ class StreetCoder:
         self._state, self._model = made.state, made.rate or self._model
         squares = np.mean((made.reconstruction.y.astype(float) - frame.y) ** 2)
         self.psnr_db[job.capture.index] = float(10 * np.log10(255**2 / squares))
-        return EncodedFrame(made.packet, {"encode": CODING_S}, made.pose, crf=made.crf)
+        return EncodedFrame(
+            made.packet, {"encode": CODING_S}, Pose.identity(), tries=made.tries, crf=made.crf
+        )
 
 
 @dataclass
