@@ -19,21 +19,19 @@ from rfedge.results import Result, make_result, provenance, write_result
 
 __all__ = ["CASES", "Bench", "Rows", "print_rows", "run_case"]
 
-CASES = ("raster", "train", "codec", "ngp", "decoders")
-Rows = Literal["all", "native", "modes"]
-"""Rows to run: ``native`` leaves out what only the slow reference fills in, ``modes`` are
-the specialisations of the renderer instead."""
+CASES = ("raster", "train", "codec", "ngp")
+Rows = Literal["all", "native"]
+"""Rows to run: ``native`` leaves out what only the slow reference fills in."""
 
 
 @dataclass(frozen=True)
 class Bench:
     """Check a part against its definition, then time it: medians of at least 20 repetitions."""
 
-    case: Annotated[Literal["raster", "train", "codec", "ngp", "decoders"], Positional]
+    case: Annotated[Literal["raster", "train", "codec", "ngp"], Positional]
     """The case to measure."""
-    rows: Literal["all", "native", "modes"] = "all"
-    """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
-    antialiasing, depth and opacity cost, as ratios (raster only)."""
+    rows: Literal["all", "native"] = "all"
+    """`native` leaves out the timing of the slow torch reference (raster only)."""
     field: Annotated[Path | None, FIELD] = None
     """A trained hash grid of the sample street to time, instead of one learnt on the spot (ngp
     only)."""
@@ -76,9 +74,9 @@ def _rows_of(case: str, rows: Rows, field: Path | None, isa: str | None) -> Sequ
 
         return opencl_rows(isa)
     if case == "raster":
-        from lab.bench.raster import mode_rows, raster_rows
+        from lab.bench.raster import raster_rows
 
-        return mode_rows() if rows == "modes" else raster_rows(rows)
+        return raster_rows(rows)
     if case == "train":
         from lab.bench.train import train_rows
 
@@ -91,10 +89,6 @@ def _rows_of(case: str, rows: Rows, field: Path | None, isa: str | None) -> Sequ
         from lab.bench.ngp import ngp_rows
 
         return ngp_rows(field)
-    if case == "decoders":
-        from lab.bench.codec import decoder_rows
-
-        return decoder_rows()
     raise InvalidInput("case", f"{case!r} is not one of {', '.join(CASES)}")
 
 

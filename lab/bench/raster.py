@@ -4,10 +4,7 @@ Before anything is timed, a small picture must follow the reference in float64: 
 1e-5, but for those where an alpha or a transmittance rounds across a threshold.
 
 ``raster_rows`` times the colour picture alone, which is what both ends of the codec predict from;
-depth and opacity beside it take 7 % longer at 640x360 and 25 % at 1920x1080. ``mode_rows`` compares
-the kernels that are compiled for one setting each (SH degree, antialiasing, depth and opacity).
-They render in turns, one picture each a round, so that a ratio compares pictures rendered under the
-same load of the machine.
+depth and opacity beside it take 7 % longer at 640x360 and 25 % at 1920x1080.
 
 ``opencl_rows`` times the renderer of an OpenCL device on the same street, beside the CPU's. Before
 a size is timed, the device's view of it must have the bytes of the CPU's. Then the two
@@ -36,13 +33,10 @@ from rfcore.raster.native import Rasterizer
 from rfedge.timing import median_ms, medians_ms
 
 __all__ = [
-    "BASELINE",
     "OPENCL_SIZES_PX",
-    "ModeRow",
     "OpenClRow",
     "RasterRow",
     "check_against_reference",
-    "mode_rows",
     "opencl_rows",
     "raster_rows",
 ]
@@ -126,67 +120,6 @@ def _check_bytes(device: Rasterizer, native: Rasterizer, camera: Camera) -> None
             raise RfedgeError(f"the {name} of {device.isa} is not that of {native.isa}")
     if device.field_view(camera).render.digest() != native.field_view(camera).render.digest():
         raise RfedgeError(f"the codec's picture of {device.isa} is not that of {native.isa}")
-
-
-MODE_SIZES_PX = ((300, 168), (640, 360), (1920, 1080))
-BASELINE = "degree 3"
-
-
-@dataclass(frozen=True)
-class ModeRow:
-    """One kernel at one size, on one thread; times are medians."""
-
-    width: int
-    height: int
-    gaussians: int
-    isa: str
-    mode: str
-    native_ms: float
-    ratio: float
-    """``native_ms`` over that of colour alone with all three SH degrees."""
-
-
-def mode_rows() -> list[ModeRow]:
-    """Return one row per size and mode; raise ``RfedgeError`` when the renderer is wrong."""
-    gaussians = _checked_street()
-    rasterizers = _rasterizers(gaussians)
-    rows = []
-    for width, height in MODE_SIZES_PX:
-        medians = medians_ms(_modes(rasterizers, street_camera(width, height)))
-        rows += [
-            ModeRow(
-                width=width,
-                height=height,
-                gaussians=len(gaussians),
-                isa=rasterizers["plain"].isa,
-                mode=mode,
-                native_ms=native_ms,
-                ratio=native_ms / medians[BASELINE],
-            )
-            for mode, native_ms in medians.items()
-        ]
-    return rows
-
-
-def _rasterizers(gaussians: Gaussians) -> dict[str, Rasterizer]:
-    without_bands = replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, :1]))
-    return {
-        "plain": Rasterizer(gaussians),
-        "without bands": Rasterizer(without_bands),
-        "antialiased": Rasterizer(gaussians, antialiased=True),
-    }
-
-
-def _modes(rasterizers: dict[str, Rasterizer], camera: Camera) -> dict[str, Callable[[], object]]:
-    plain = rasterizers["plain"]
-    return {
-        BASELINE: lambda: plain.render_colour(camera),
-        "degree 1": lambda: plain.render_colour(camera, sh_degree=1),
-        "degree 0": lambda: plain.render_colour(camera, sh_degree=0),
-        "field of degree 0": lambda: rasterizers["without bands"].render_colour(camera),
-        "antialiased": lambda: rasterizers["antialiased"].render_colour(camera),
-        "depth and opacity": lambda: plain.render(camera),
-    }
 
 
 SIZES_PX = ((300, 168), (640, 360), (1280, 720), (1920, 1080))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import FOLDER
+from rfedge.results import check_result_path, make_result, provenance, write_result
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,40 +29,31 @@ class PlanCity:
     """Its vehicles: FCD output of SUMO, in place of the stated demand."""
     step_s: float = 1.0
     """Seconds between the steps of its stated demand."""
-    samples: int = 9
-    """Servers that also run with the product's session machines, to check the flow model."""
-    sample_s: float = 30.0
-    """Seconds of the virtual clock for which they are counted, after 20 s."""
-    out: Annotated[Path, FOLDER] = Path("out/city")
-    """Folder for the city's report.html and city.json."""
-    json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
-    """Write one JSON object to this file; `-` is standard output."""
+    out: Path = Path("out/eval/city.json")
+    """The result file to write."""
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
 
     def run(self) -> None:
-        """Plan the city; print it, or write JSON."""
+        """Plan the city, write the result and print it."""
         from rich.console import Console
 
-        from lab.city.check import CheckPlan, check_plan
         from lab.city.city import read_city
         from lab.city.flow import costs_of
         from lab.city.plan import plan_city
-        from lab.city.report import print_city, write_city
-        from rfedge.results import provenance, write_result
+        from lab.city.report import city_content, city_parts
+        from rfedge.report.tables import print_tables
         from rfedge.sizing.tables import shipped_tables
 
-        check = CheckPlan(self.samples, counted_s=self.sample_s)
-        city = read_city(self.city)
-        costs = costs_of(city, shipped_tables())
-        plan = plan_city(city, costs, self._traffic(city))
-        checks = check_plan(plan, check)
         made = provenance([self.city, *([self.fcd] if self.fcd else [])])
-        result = write_city(self.out, made, self.city.stem, plan, checks)
-        if self.json is not None:
-            write_result(self.json, result)
-            return
-        print_city(Console(), plan, checks)
-        for name in ("report.html", "city.json"):
-            Console().print(f"  {self.out / name}")
+        city = read_city(self.city)
+        plan = plan_city(city, costs_of(city, shipped_tables()), self._traffic(city))
+        result = make_result("city", made, city_content(plan))
+        write_result(self.out, result)
+        console = Console()
+        console.print(result["headline"], markup=False, highlight=False)
+        print_tables(city_parts(result), console)
 
     def _traffic(self, city: City) -> Iterator[TrafficBlock]:
         from lab.city.traffic import stated_traffic, trace_traffic

@@ -7,7 +7,7 @@ busiest step. Ages are of the minute's mean flow, once a minute for every cell.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from lab.city.city import City, Floats
 from lab.city.flow import Costs, Flow, SharedLoad, age_samples_s, city_flow
 from lab.city.traffic import TrafficBlock
 from rfcore.errors import InvalidInput
+from rfedge.report.tables import shown
 
 __all__ = ["CellRow", "CityPlan", "LimitRow", "Minute", "MinuteRow", "ServerRow", "plan_city"]
 
@@ -50,20 +51,20 @@ class MinuteRow:
     """The city in a minute from ``at_s`` on. ``rate_hz``: pictures a second of a camera, mean of
     those served; ages are None while nobody is."""
 
-    at_s: float
-    vehicles: float
+    at_s: float = field(metadata=shown("at s", ".0f"))
+    vehicles: float = field(metadata=shown("vehicles", ".0f"))
     outside: float
     served: float
-    refused: float
-    rate_hz: float
-    handovers_per_s: float
+    refused: float = field(metadata=shown("refused", ".0f"))
+    rate_hz: float = field(metadata=shown("Hz", ".1f"))
+    handovers_per_s: float = field(metadata=shown("handovers a second", ".1f"))
     begun_per_s: float
-    uplink_mbps: float
+    uplink_mbps: float = field(metadata=shown("Mbit/s up", ".0f"))
     downlink_mbps: float
-    cores: float
+    cores: float = field(metadata=shown("cores", ".1f"))
     age_p50_ms: float | None = None
     age_p95_ms: float | None = None
-    age_p99_ms: float | None = None
+    age_p99_ms: float | None = field(default=None, metadata=shown("age p99 ms", ".0f"))
 
 
 @dataclass(frozen=True)
@@ -89,18 +90,18 @@ class ServerRow:
     """A server: most vehicles, mean and most of cores in use and of Mbit/s received, most Mbit/s
     sent and handovers to it, most of what is asked of the cores that it may promise."""
 
-    name: str
-    cores: float
-    vehicles: float
-    refused_percent: float
+    name: str = field(metadata=shown("server"))
+    cores: float = field(metadata=shown("cores", ".0f"))
+    vehicles: float = field(metadata=shown("vehicles", ".0f"))
+    refused_percent: float = field(metadata=shown("refused %", ".1f"))
     busy_cores: float
-    most_busy_cores: float
+    most_busy_cores: float = field(metadata=shown("cores in use", ".1f"))
     uplink_mbps: float
-    most_uplink_mbps: float
+    most_uplink_mbps: float = field(metadata=shown("Mbit/s up", ".0f"))
     most_downlink_mbps: float
     most_handovers_per_s: float
-    load_share: float
-    age_p99_ms: float | None = None
+    load_share: float = field(metadata=shown("asked of its cores", ".2f"))
+    age_p99_ms: float | None = field(default=None, metadata=shown("age p99 ms", ".0f"))
 
 
 @dataclass(frozen=True)
@@ -111,21 +112,20 @@ class LimitRow:
     demand brings it to 1, None of ages, which do not grow with the demand.
     """
 
-    limit: str
-    share: float
-    where: str
-    at_s: float
-    demand_factor: float | None = None
-    broken_at_s: float | None = None
+    limit: str = field(metadata=shown("limit"))
+    share: float = field(metadata=shown("asked", ".2f"))
+    where: str = field(metadata=shown("where"))
+    at_s: float = field(metadata=shown("at s", ".0f"))
+    demand_factor: float | None = field(default=None, metadata=shown("times the demand", ".2f"))
+    broken_at_s: float | None = field(default=None, metadata=shown("broken from s", ".0f"))
 
 
 @dataclass(frozen=True)
 class CityPlan:
-    """Everything; ``minutes`` are the arrays behind the rows, not written to a result."""
+    """A city with its costs, and what every minute, cell and server comes to."""
 
     city: City
     costs: Costs
-    minutes: Sequence[Minute]
     rows: Sequence[MinuteRow]
     cells: Sequence[CellRow]
     servers: Sequence[ServerRow]
@@ -146,7 +146,6 @@ def plan_city(city: City, costs: Costs, traffic: Iterable[TrafficBlock]) -> City
     return CityPlan(
         city=city,
         costs=costs,
-        minutes=minutes,
         rows=[_minute_row(minute) for minute in minutes],
         cells=_cell_rows(city, minutes),
         servers=_server_rows(city, minutes),

@@ -22,14 +22,15 @@ from rich.console import Console
 
 from lab.live import EvalLive
 from lab.live.report import AgeRow, IngestRow, SourceRow, live_parts
-from lab.live.showing import TwinBed, agent, measure_age, measure_ingest, watching
+from lab.live.showing import PictureAges, TwinBed, agent, measure_age, measure_ingest
 from lab.soak import slope_per_minute
+from lab.twin_reader import reading
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable, RfedgeError
 from rfcore.image import jpeg_bytes
 from rfedge.loadtest.usage import Usage, Watcher
 from rfedge.processes import command_of, service
-from rfedge.report.tables import Table
+from rfedge.report.tables import print_tables
 from rfedge.results import CHECKOUT, make_result, provenance, write_result
 
 __all__ = ["LiveCamera", "measure_source", "run_live"]
@@ -157,14 +158,15 @@ def measure_source(camera: LiveCamera, drive: Path, field: Path, work: Path) -> 
         arguments = ["--server", serving.address, *fields, "--effort", "fast"]
         arguments += ["--source", sender.source(), "--camera-file", str(camera.folder)]
         arguments += ["--source-timeout-s", "2", "--report", str(report)]
-        with agent("live", arguments, work) as driving, watching(serving.address, 1) as consumers:
-            _await_pictures(report, consumers[0].ages_ms, driving)
+        ages = PictureAges()
+        with agent("live", arguments, work) as driving, reading(serving.address, ages.take):
+            _await_pictures(report, ages.ages_ms, driving)
             pids = {"agent": driving.pid, "server": serving.process.pid}
             watcher = Watcher(pids)
             watcher.start()
             kills = _kill_again_and_again(sender, camera)
             usage = watcher.stop()
-            return _row(camera, kills, _lines(report), consumers[0].ages_ms, usage)
+            return _row(camera, kills, _lines(report), ages.ages_ms, usage)
 
 
 def _await_pictures(report: Path, ages_ms: list[float], process: subprocess.Popen[bytes]) -> None:
@@ -260,6 +262,4 @@ def run_live(job: EvalLive, console: Console) -> None:
 
 
 def _print(console: Console, part: str, row: AgeRow | IngestRow | SourceRow) -> None:
-    for table in live_parts({part: [asdict(row)]}):
-        if isinstance(table, Table):
-            table.print(console)
+    print_tables(live_parts({part: [asdict(row)]}), console)

@@ -12,21 +12,20 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lab.live.report import AgeRow, IngestRow
+from lab.twin_reader import reading
 from rfcore.errors import BackendUnavailable, RfedgeError
 from rfcore.extras import needs
 from rfcore.field import load_field
 from rfcore.wire.twin import TwinPicture
-from rfcore.wire.twin_client import TwinClient
 from rfedge.loadtest.drive import drive_prerecorded
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.prerecorded import prerecorded_drive
@@ -38,17 +37,15 @@ with needs("loadtest"):
     from selenium.webdriver.chrome.service import Service as Driver
 
 __all__ = [
-    "Consumer",
+    "PictureAges",
     "TwinBed",
     "agent",
     "ingest_latencies_ms",
     "measure_age",
     "measure_ingest",
-    "watching",
 ]
 
 STOP_S = 20.0
-END_S = 10.0
 
 
 @contextmanager
@@ -75,36 +72,15 @@ def agent(name: str, arguments: Sequence[str], work: Path) -> Iterator[subproces
             raise RfedgeError(f"{name} did not end; see {log_path}") from None
 
 
-class Consumer:
-    """Reads all pictures of a server as JPEG; ``ages_ms`` [N]: from capture until it had them."""
+class PictureAges:
+    """Notes the age of every picture when a consumer has it, in milliseconds."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self) -> None:
         self.ages_ms: list[float] = []
-        self._client = TwinClient(address)
-        self._thread = threading.Thread(target=self._read, name="consumer", daemon=True)
-        self._thread.start()
 
-    def _read(self) -> None:
-        with suppress(RfedgeError):  # the server has ended
-            for message in self._client.watch():
-                if isinstance(message, TwinPicture):
-                    self.ages_ms.append((time.time_ns() - message.capture_time_ns) / 1e6)
-
-    def close(self) -> None:
-        """End."""
-        self._client.stop()
-        self._thread.join(END_S)
-        self._client.close()
-
-
-@contextmanager
-def watching(address: str, count: int) -> Iterator[list[Consumer]]:
-    """Watch with ``count`` consumers until the block ends."""
-    with ExitStack() as stack:
-        consumers = [Consumer(address) for _ in range(count)]
-        for consumer in consumers:
-            stack.callback(consumer.close)
-        yield consumers
+    def take(self, picture: TwinPicture) -> None:
+        """Note the age of a picture."""
+        self.ages_ms.append((time.time_ns() - picture.capture_time_ns) / 1e6)
 
 
 OPTIONS = (
@@ -269,7 +245,7 @@ def measure_ingest(bed: TwinBed, rounds: int, consumers: int) -> IngestRow:
             with (
                 bed.twin(server.address) as url,
                 opened(url),
-                watching(server.address, consumers),
+                reading(server.address, lambda _: None, consumers),
             ):
                 watched_ms += ingest_latencies_ms(bed, server)
     return IngestRow(

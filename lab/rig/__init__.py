@@ -51,7 +51,7 @@ class EvalRig:
         from lab.rig.run import run_rig
         from rfcore.dataset.rig import read_rig
         from rfedge.arguments import field_path
-        from rfedge.report.tables import Table
+        from rfedge.report.tables import print_tables
         from rfedge.results import write_result
 
         for path in filter(None, (self.rig, self.many)):
@@ -59,6 +59,4 @@ class EvalRig:
         console = Console()
         result = run_rig(replace(self, field=field_path(self.field)), console)
         write_result(self.out, result)
-        for part in rig_parts(result):
-            if isinstance(part, Table):
-                part.print(console)
+        print_tables(rig_parts(result), console)

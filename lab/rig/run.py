@@ -11,7 +11,6 @@ import json
 import os
 import statistics
 import subprocess
-import threading
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -23,46 +22,17 @@ from rich.console import Console
 
 from lab.rig import EvalRig
 from lab.rig.report import CameraRow, SessionRow
+from lab.twin_reader import TwinReader
 from rfcore.dataset.rig import Rig, RigCamera, RigInstant, read_rig, read_rig_drive
 from rfcore.errors import RfedgeError
 from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
-from rfcore.wire.twin_client import TwinClient
 from rfedge.processes import Service, command_of, service
 from rfedge.results import Result, as_json, make_result, provenance
 
-__all__ = ["Spread", "TwinKeeper", "instants_apart", "run_rig", "spreads_of"]
-
-
-class TwinKeeper:
-    """Keeps the pictures of a server, in the order in which they were shown, inside ``with``."""
-
-    def __init__(self, address: str) -> None:
-        self._client = TwinClient(address)
-        self._thread = threading.Thread(target=self._run, name="twin")
-        self._watching = threading.Event()
-        self.pictures: list[TwinPicture] = []
-
-    def __enter__(self) -> TwinKeeper:
-        self._thread.start()
-        self._watching.wait()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._client.stop()
-        self._thread.join()
-        self._client.close()
-
-    def _run(self) -> None:
-        wanted = Subscription(encoding=PictureEncoding.I420)
-        try:
-            for message in self._client.watch(wanted, connected=self._watching.set):
-                if isinstance(message, TwinPicture):
-                    self.pictures.append(message)
-        finally:
-            self._watching.set()
+__all__ = ["Spread", "instants_apart", "run_rig", "spreads_of"]
 
 
 @dataclass(frozen=True)
@@ -168,16 +138,17 @@ def _outcome(job: EvalRig, case: Case, rig: Rig) -> Outcome:
     server = [*command_of("mec-server"), "--fields", str(_fields(job)), "--listen", "127.0.0.1:0"]
     server += ["--threads", str(job.threads), "--max-load", "0"]
     report = work / "link.json"
+    pictures: list[TwinPicture] = []
     with (
         service("server", server, work) as served,
-        TwinKeeper(served.address) as keeper,
+        TwinReader(served.address, pictures.append, Subscription(encoding=PictureEncoding.I420)),
         service("link", _link_command(job, served, report), work) as link,
     ):
         vehicles = _vehicles(job, case, rig, link)
         agent_mb = _run_together(vehicles, work)
     return Outcome(
         lines={name: _lines(work / f"{name}.jsonl") for name in vehicles},
-        pictures=keeper.pictures,
+        pictures=pictures,
         link_bytes=int(json.loads(report.read_text())["uplink"]["bytes"]),
         agent_mb=agent_mb,
     )

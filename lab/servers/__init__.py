@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
-
 from rfcore.errors import InvalidInput
 from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, field_path
 from rfedge.samples import sample_path
@@ -59,8 +57,6 @@ class EvalScale:
     trainings."""
     ray_iterations: int = 2000
     """Iterations of each of those."""
-    city: Annotated[Path | None, arg(metavar="CITY.toml")] = None
-    """Also time `rfedge-lab city` of this city, such as samples/sizing/metropolis.toml."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive that the servers publish."""
     drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 import subprocess
-import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -17,11 +16,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import grpc
-
+from lab.twin_reader import TwinReader
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
-from rfcore.wire.twin_client import TwinClient
 from rfedge.processes import command_of
 
 __all__ = [
@@ -174,14 +171,11 @@ def _are_mixed(shown: Sequence[tuple[int, str]]) -> bool:
 
 
 class TwinWatch:
-    """Watches the twins of servers, in a thread each, until it is left.
-
-    A server that ends or is killed has been watched to its end.
-    """
+    """Notes which pictures the twins of servers show, until it is left."""
 
     def __init__(self) -> None:
-        self.pictures: list[ShownPicture] = []
-        self._problems: list[str] = []
+        self._pictures: list[ShownPicture] = []
+        self._readers: dict[str, TwinReader] = {}
         self._stack = ExitStack()
 
     def __enter__(self) -> TwinWatch:
@@ -192,26 +186,17 @@ class TwinWatch:
 
     def add(self, address: str) -> None:
         """Watch one more server from now on."""
-        client = self._stack.enter_context(TwinClient(address))
-        thread = threading.Thread(target=self._watch, args=(client,), daemon=True)
-        thread.start()
-        self._stack.callback(thread.join, WAIT_S)
-        self._stack.callback(client.stop)
+
+        def take(picture: TwinPicture) -> None:
+            shown = ShownPicture(*picture.key, picture.capture_time_ns, address)
+            self._pictures.append(shown)
+
+        reader = TwinReader(address, take, Subscription(encoding=PictureEncoding.NONE))
+        self._readers[address] = self._stack.enter_context(reader)
 
     def result(self) -> list[ShownPicture]:
         """Return what was shown so far; raise ``RfedgeError`` for a server that showed nothing."""
-        if self._problems:
-            raise RfedgeError("; ".join(self._problems))
-        return list(self.pictures)
-
-    def _watch(self, client: TwinClient) -> None:
-        address = str(client.address)
-        try:
-            for message in client.watch(Subscription(encoding=PictureEncoding.NONE)):
-                if isinstance(message, TwinPicture):
-                    shown = ShownPicture(*message.key, message.capture_time_ns, address)
-                    self.pictures.append(shown)
-        except RfedgeError as error:
-            call = error.__cause__
-            if not (isinstance(call, grpc.Call) and call.code() is grpc.StatusCode.UNAVAILABLE):
-                self._problems.append(f"{address} does not show its pictures: {error}")
+        for address, reader in self._readers.items():
+            if reader.problem is not None:
+                raise RfedgeError(f"{address} does not show its pictures: {reader.problem}")
+        return list(self._pictures)

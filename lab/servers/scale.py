@@ -8,7 +8,6 @@ from __future__ import annotations
 import shutil
 import signal
 import statistics
-import subprocess
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -16,7 +15,6 @@ from datetime import UTC, datetime
 
 from rich.console import Console
 
-from lab.city.check import CheckRow, largest_differences
 from lab.city.planned_load import PlannedLoad, compare_with_plan
 from lab.servers import EvalScale
 from lab.servers.cases import Case, Measured, ScaleRecord, ScaleRow
@@ -38,9 +36,8 @@ from rfcore.wire.tiles import Area
 from rfedge.arguments import parse_size
 from rfedge.datasets.convert import convert_dataset
 from rfedge.loadtest.run import TestBed
-from rfedge.processes import command_of
 from rfedge.report.tables import Table, columns
-from rfedge.results import provenance, read_result, rows_of
+from rfedge.results import provenance
 from rfedge.samples import sample_path
 
 __all__ = ["cases_of", "planned_load", "run_scale"]
@@ -50,7 +47,6 @@ RESUME_S = 1.0
 RESTART_S = 3.0
 ADDED_MS = 3.0
 PLANNED_PERCENT, PLANNED_AGE_PERCENT = 15.0, 25.0
-CITY_S = 600.0
 PAIR_HZ = 10.0
 EVERYWHERE = Ground(Area((-1e4, -1e4), (1e4, 1e4)), 0.0)
 
@@ -102,35 +98,9 @@ def cases_of(job: EvalScale) -> list[Case]:
 
         require("ray", "ray")
         cases.append(ray_case(job.ray_tiles, job.ray_iterations))
-    if job.city is not None:
-        cases.append(_city_rows)
     if not cases:
         raise InvalidInput("envoy", "nothing is to be measured; give --planned numbers")
     return cases
-
-
-def _city_rows(job: EvalScale) -> Measured:
-    """Plan a city by ``rfedge-lab city``: how long that takes, and how far the model is off."""
-    city = job.city
-    assert city is not None
-    out = job.work / "city"
-    command = [*command_of("rfedge-lab"), "city", str(city), "--out", str(out)]
-    begin_s = time.monotonic()
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    took_s = time.monotonic() - begin_s
-    if done.returncode != 0:
-        raise RfedgeError(f"{city} was not planned: {done.stderr[-500:]}")
-    checks = rows_of(CheckRow, read_result(out / "city.json", "city")["checks"])
-    at_most = ScaleRow.at_most
-    return Measured(
-        [
-            at_most(f"{city.stem} planned, s", CITY_S, took_s),
-            *(
-                at_most(f"{city.stem}, flow against sessions: {figure}, % off", _bound(figure), off)
-                for figure, _, off in largest_differences(checks)
-            ),
-        ]
-    )
 
 
 def planned_load(job: EvalScale) -> PlannedLoad:

@@ -37,7 +37,7 @@ from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S
 from rfedge.loadtest.prerecorded import PrerecordedDrive, Schedule, prerecorded_drive
 from rfedge.loadtest.vehicle import PrerecordedVehicle
 from rfedge.processes import command_of
-from rfedge.report.tables import Table
+from rfedge.report.tables import print_tables
 from rfedge.results import (
     as_json,
     make_result,
@@ -83,9 +83,7 @@ def run_world(asked: EvalWorld) -> None:
         kept[name] = cases[name]()
         rows = [as_json(row) for part in cases for row in kept.get(part, [])]
         write_result(str(asked.out), make_result("world", source, {"rows": rows}))
-    for part in world_parts(read_result(asked.out)):
-        if isinstance(part, Table):
-            part.print(console)
+    print_tables(world_parts(read_result(asked.out)), console)
 
 
 def _kept(out: Path, revision: str) -> dict[str, list[WorldRow]]:

@@ -20,7 +20,7 @@ from rich.console import Console
 from rfedge.evaluate import Experiment
 from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip
 from rfedge.jobs import Cell, CellKey, CellStore, Job, run_jobs
-from rfedge.report.tables import Parts, Table
+from rfedge.report.tables import Parts, print_tables
 from rfedge.results import CHECKOUT, Provenance, make_result, provenance, write_result
 
 __all__ = ["Run", "clip_key", "coded_clip", "program_version"]
@@ -60,9 +60,7 @@ class Run:
         """Write the result, print the tables among its ``parts``, and return the result."""
         result = make_result(self.kind, self.made, {"quick": self.job.quick, **content})
         write_result(self.job.out, result)
-        for part in parts(result):
-            if isinstance(part, Table):
-                part.print(self.console)
+        print_tables(parts(result), self.console)
         return result
 
 

@@ -38,6 +38,7 @@ __all__ = [
     "cell",
     "columns",
     "named_columns",
+    "print_tables",
     "shown",
     "text_table",
 ]
@@ -200,6 +201,13 @@ class Table:
 
 Parts = Callable[[Mapping[str, Any]], Iterable[Table | str]]
 """Returns what is shown of a result: paragraphs and tables."""
+
+
+def print_tables(parts: Iterable[Table | str], console: Console) -> None:
+    """Print the tables of a result; its paragraphs are for pages."""
+    for part in parts:
+        if isinstance(part, Table):
+            part.print(console)
 
 
 def text_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> Table:

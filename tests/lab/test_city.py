@@ -34,6 +34,7 @@ from lab.city.flow import (
 )
 from lab.city.plan import plan_city
 from lab.city.traffic import TrafficBlock
+from lab.cli import parse
 from lab.robust.run import kbit_between
 from mec_server.config import AdmissionLimits
 from rfcore.errors import InvalidData, InvalidInput
@@ -334,3 +335,36 @@ def test_a_saturated_cell_holds_what_credits_allow() -> None:
     assert ages_s.min() >= least_s - 1e-9
     assert ages_s.max() <= least_s + 0.1
     assert math.isclose(even.path_s, 0.11)
+
+
+# --- the command
+
+
+def test_a_city_is_planned_into_a_result(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pressed = tmp_path / "city.toml"
+    pressed.write_text(SAMPLE.read_text().replace("cores = 6", "cores = 1"))
+    out = tmp_path / "city.json"
+    parse(["city", str(pressed), "--out", str(out), "--step-s", "5"]).run()
+    assert "First broken: cores that a server may promise" in capsys.readouterr().out
+    result = read_result(out, "city")
+    assert len(result["minutes"]) == 30
+    assert [row["name"] for row in result["servers"]] == ["station", "harbour"]
+    with pytest.raises(InvalidInput, match="step-s"):
+        parse(["city", str(pressed), "--out", str(out), "--step-s", "0"]).run()
+
+
+def test_a_trace_takes_the_place_of_the_demand(tmp_path: Path) -> None:
+    steps = "".join(
+        f'<timestep time="{step}"><vehicle id="a" x="{3 * step}" y="0"/></timestep>\n'
+        for step in range(120)
+    )
+    trace = tmp_path / "fcd.xml"
+    trace.write_text(f"<fcd-export>{steps}</fcd-export>")
+    out = tmp_path / "city.json"
+    parse(["city", str(SAMPLE), "--fcd", str(trace), "--out", str(out)]).run()
+    result = read_result(out, "city")
+    assert [row["vehicles"] for row in result["minutes"]] == [1.0, 1.0]
+    assert sum(60 * row["handovers_per_s"] for row in result["minutes"]) == pytest.approx(1)
+    assert str(trace) in result["inputs"]

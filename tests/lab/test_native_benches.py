@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from forward_isas import DEVICE, OPENCL
-from lab.bench import print_rows, raster, run_case, train
+from lab.bench import codec, print_rows, raster, run_case, train
 from lab.bench.street import street_camera, street_gaussians
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput, RfedgeError
@@ -22,7 +22,6 @@ RASTER_KEYS = [
     *("width", "height", "gaussians", "visible", "blends_per_px", "threads", "isa"),
     *("native_ms", "reference_ms", "max_abs_error"),
 ]
-MODE_KEYS = ["width", "height", "gaussians", "isa", "mode", "native_ms", "ratio"]
 OPENCL_KEYS = [
     *("width", "height", "gaussians", "device", "device_ms", "device_view_ms"),
     *("isa", "threads", "native_ms", "native_view_ms", "ratio"),
@@ -80,24 +79,6 @@ def test_raster_rows_have_the_published_keys_and_null_where_not_run() -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_modes_are_compared_with_the_whole_colour(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(raster, "MODE_SIZES_PX", ((30, 20),))
-    rows = run_case("raster", rows="modes")["rows"]
-    assert [list(row) for row in rows] == [MODE_KEYS] * 6
-    by_mode = {row["mode"]: row for row in rows}
-    assert by_mode[raster.BASELINE]["ratio"] == 1.0
-    assert {"degree 0", "antialiased", "depth and opacity"} < set(by_mode)
-    assert all(row["native_ms"] > 0 for row in rows)
-
-
-def test_calls_that_are_compared_take_turns() -> None:
-    order: list[str] = []
-    calls = {name: lambda name=name: order.append(name) for name in "ab"}
-    assert set(timing.medians_ms(calls, repetitions=2)) == {"a", "b"}
-    assert "".join(order) == "ababab"
-
-
-@pytest.mark.usefixtures("small")
 def test_a_result_says_where_it_came_from_and_survives_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,3 +122,24 @@ def test_the_street_has_the_density_it_promises() -> None:
     statistics = Rasterizer(street_gaussians()).statistics(street_camera(320, 180))
     assert statistics.blends_per_px == pytest.approx(47, abs=3)
     assert statistics.visible == pytest.approx(130_300, rel=0.01)
+
+
+def test_every_coder_has_its_row_at_each_number_of_references(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(codec, "street_gaussians", lambda: street_gaussians(2000))
+    monkeypatch.setattr(codec, "SIZES_PX", ((64, 48),))
+    monkeypatch.setattr(codec, "THREADS", (2,))
+    monkeypatch.setattr(codec, "WARM_UP", 1)
+    monkeypatch.setattr(codec, "REPETITIONS", 2)
+    rows = codec.codec_rows()
+    assert [(row.references, row.effort) for row in rows] == [
+        (references, effort) for references in (1, 3) for effort in codec.EFFORTS
+    ]
+    for row in rows:
+        assert (row.threads, row.width, row.height) == (2, 64, 48)
+        assert row.payload_bytes > 0
+        assert row.psnr_db > 25
+        assert row.sender_ms["total"] > row.sender_ms["render"] > 0
+        assert row.receiver_ms["total"] > 0
+        assert row.sender_ms["relight"] == row.receiver_ms["relight"] > 0

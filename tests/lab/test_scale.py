@@ -1,6 +1,5 @@
 """What is read from vehicles' reports, and the cases once, with few small vehicles."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -106,21 +105,6 @@ def test_vehicles_that_are_shown_twice_are_counted_once_and_cameras_are_apart() 
     assert shown_twice(good) == 0
     bad = shown("1a 1b", "y", "left") + shown("1a 1b", "y", "right") + shown("1a 1b", "z")
     assert shown_twice(good + bad) == 2
-
-
-@pytest.mark.slow
-def test_a_citys_rows_are_its_time_and_how_far_flow_and_sessions_are_apart(tmp_path: Path) -> None:
-    (plan,) = cases_of(EvalScale(envoy=False, city=sample_path("sizing/city.toml"), work=tmp_path))
-    measured = plan(EvalScale(city=sample_path("sizing/city.toml"), work=tmp_path))
-    cases = [row.case for row in measured.rows]
-    assert cases[0] == "city planned, s"
-    bounds = {row.case.partition(": ")[2]: row.bound for row in measured.rows[1:]}
-    assert bounds["cores, % off"] == 15
-    assert bounds["age p99, ms, % off"] == 25
-    written = json.loads((tmp_path / "city" / "city.json").read_text())["checks"]
-    most = max(abs(row["difference_percent"]) for row in written if row["figure"] == "cores")
-    (cores,) = (row for row in measured.rows if row.case.endswith(": cores, % off"))
-    assert cores.measured == most
 
 
 def test_a_percentile_of_few_values_is_the_largest_and_of_none_an_error() -> None:
