@@ -56,22 +56,15 @@ class BenchmarkRun:
         from functools import partial
 
         from lab.benchmark.definition import read_benchmark
-        from lab.benchmark.method import Command, MethodJob, run_method
+        from lab.benchmark.method import run_method
 
-        benchmark, datasets = read_benchmark(), _datasets(self.drive)
-        required = tuple(drive.name for drive in benchmark.drives if drive.required)
-        job = MethodJob(
-            command=Command(self.method, timeout_s=self.timeout_s),
-            name=self.name,
-            version=self.version,
-            points=self.points,
-            drives=self.only or tuple(dict.fromkeys((*required, *datasets))),
-            datasets=datasets,
-            prior=self.prior,
-            out=self.out,
-        )
-        run_method(job, benchmark, partial(print, flush=True))
+        run_method(self, read_benchmark(), partial(print, flush=True))
         print(f"{self.out}: check it with `rfedge-lab benchmark check {self.out}`")
+
+    @property
+    def datasets(self) -> dict[str, Path]:
+        """Datasets of the drives that are not among the samples, by the drive's name."""
+        return _datasets(self.drive)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from lab.benchmark import BenchmarkRun
 from lab.benchmark.definition import Benchmark
 from lab.benchmark.submission import (
     PACKET,
@@ -40,7 +41,7 @@ from rfcore.image import I420, write_png
 from rfedge.evaluate.clips import Drive
 from rfedge.results import host
 
-__all__ = ["CODER_NEEDS", "DECODER_NEEDS", "Command", "MethodJob", "check_decoder", "run_method"]
+__all__ = ["CODER_NEEDS", "DECODER_NEEDS", "Command", "check_decoder", "run_method"]
 
 CODER_NEEDS, DECODER_NEEDS = ("frames", "point", "out"), ("packets", "out")
 MAY_NAME = ("hz", "point", "prior")
@@ -106,21 +107,7 @@ def _children_cpu_ms() -> float:
     return 1e3 * (used.ru_utime + used.ru_stime)
 
 
-@dataclass(frozen=True)
-class MethodJob:
-    """A command to make a submission with; see ``rfedge-lab benchmark run --help``."""
-
-    command: Command
-    name: str
-    version: str
-    points: tuple[float, ...]
-    drives: tuple[str, ...]
-    datasets: Mapping[str, Path]
-    prior: tuple[Path, ...]
-    out: Path
-
-
-def run_method(job: MethodJob, benchmark: Benchmark, tell: Tell) -> None:
+def run_method(job: BenchmarkRun, benchmark: Benchmark, tell: Tell) -> None:
     """Code drives with a command at every point and write the submission to ``job.out``.
 
     At the first point of each drive the command also gets the first half of the frames alone: it
@@ -131,16 +118,18 @@ def run_method(job: MethodJob, benchmark: Benchmark, tell: Tell) -> None:
     least = benchmark.scoring.least_points
     if len(set(job.points)) < least:
         raise InvalidInput("points", f"{len(set(job.points))} given, at least {least} are needed")
-    names = job.drives or tuple(d.name for d in benchmark.drives if d.required)
+    command = Command(job.method, timeout_s=job.timeout_s)
+    required = (drive.name for drive in benchmark.drives if drive.required)
+    names = job.only or tuple(dict.fromkeys((*required, *job.datasets)))
     drives = [benchmark.drive(name).read(job.datasets.get(name)) for name in names]
     with whole_folder(job.out) as folder:
         prior = _with_prior(folder, job.prior)
-        coding = _Coding(job.command, job.points, (folder / PRIOR).resolve(), tell)
+        coding = _Coding(command, job.points, (folder / PRIOR).resolve(), tell)
         content = {
             "benchmark": benchmark.version,
             "method": job.name,
             "version": job.version,
-            "command": job.command.text,
+            "command": command.text,
             "cpu": host()["cpu"],
             "later_frames_withheld": True,
             "prior": prior,

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from lab.benchmark import BenchmarkRun
 from lab.benchmark.definition import (
     V1,
     Benchmark,
@@ -28,7 +29,6 @@ from lab.benchmark.definition import (
 from lab.benchmark.method import (
     DECODER_NEEDS,
     Command,
-    MethodJob,
     check_decoder,
     run_method,
 )
@@ -181,8 +181,9 @@ def small(thumbnail: Any, tmp_path_factory: pytest.TempPathFactory) -> Benchmark
     return replace(benchmark, recorded_sha256=hashlib.sha256(made.read_bytes()).hexdigest())
 
 
-def job_of(out: Path, method: str = X264, **change: Any) -> MethodJob:
-    return replace(MethodJob(Command(method), "x264", "1", CRFS, ("wall",), {}, (), out), **change)
+def job_of(out: Path, method: str = X264, **change: Any) -> BenchmarkRun:
+    given = BenchmarkRun(out, method, "x264", CRFS, version="1", only=("wall",))
+    return replace(given, **change)
 
 
 @pytest.fixture(scope="module")
@@ -432,9 +433,9 @@ def test_a_coder_that_looks_ahead_is_found_out(small: Benchmark, tmp_path: Path)
 def test_a_command_that_fails_is_reported(
     text: str, message: str, small: Benchmark, tmp_path: Path
 ) -> None:
-    command = Command(program(tmp_path, text), timeout_s=0.5 if "True" in text else 60)
+    job = job_of(tmp_path / "out", program(tmp_path, text))
     with pytest.raises(RfedgeError, match=message):
-        run_method(job_of(tmp_path / "out", command=command), small, quiet)
+        run_method(replace(job, timeout_s=0.5 if "True" in text else 60), small, quiet)
 
 
 @pytest.mark.parametrize(
