@@ -133,11 +133,6 @@ def test_inputs_are_named_as_given_with_their_digests_and_folders_left_out(tmp_p
     assert provenance([file, folder], at="x").inputs == expected
 
 
-def test_two_provenances_of_the_same_code_are_equal() -> None:
-    """Nothing in them depends on when or where in a run they are taken."""
-    assert provenance(at="x") == provenance(at="x")
-
-
 # --- writing and reading
 
 
@@ -176,13 +171,6 @@ def test_json_holds_every_finite_value_and_no_other(value: Any) -> None:
             as_json(value)
     else:
         assert json.loads(text_of(as_json(value))) == value
-
-
-def test_a_list_of_numbers_is_on_one_line() -> None:
-    text = text_of({"rows": [{"ssim": [0.5, None, -1e-09], "names": ["a", "b"], "none": []}]})
-    assert '"ssim": [0.5,null,-1e-09],\n' in text
-    assert '"names": [\n' in text
-    assert text_of({"a": [[1, 2], [3]]}) == '{\n "a": [\n  [1,2],\n  [3]\n ]\n}\n'
 
 
 def _has_infinity(value: Any) -> bool:

@@ -54,11 +54,6 @@ def test_a_clips_quality_and_rate_leave_out_its_first_frame():
     assert clip.bytes_per_frame(slice(0, 1)) == 900
 
 
-def test_notes_have_one_value_per_frame():
-    with pytest.raises(InvalidInput, match="notes"):
-        CodedClip(1.0, np.array([1, 2]), np.ones(2), np.ones(2), 0.0, {"references": ("a",)})
-
-
 def test_a_drive_is_read_as_far_as_asked(thumbnail):
     whole, two = read_drive(thumbnail.drive), read_drive(thumbnail.drive, 2)
     assert (len(whole.frames), len(two.frames)) == (5, 2)

@@ -59,10 +59,6 @@ def rows():
     }
 
 
-def test_the_figure_is_the_ratio_of_rates(rows):
-    assert rows["x264-lowdelay"].bd_rate_percent == pytest.approx(-50, abs=0.1)
-
-
 def test_a_family_is_represented_by_its_strongest_of_no_more_processor_time(rows):
     assert rows["svtav1-lowdelay"].rival_setting == "p8"
 

@@ -4,13 +4,11 @@ import io
 import json
 import math
 import pickle
-import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import tyro
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
@@ -18,11 +16,9 @@ from rfcore.field import load_field
 from rfedge.evaluate import runner
 from rfedge.evaluate.clips import DriveName, read_drive
 from rfedge.evaluate.compare import EvalCompare
-from rfedge.evaluate.compare import run as compare_run
 from rfedge.evaluate.compare.drives import foreign_coder, jobs_of_drives, read_drive_comparisons
 from rfedge.evaluate.compare.measure import BEST, BEST_OF_ANY_CPU
 from rfedge.evaluate.compare.run import run_compare
-from rfedge.evaluate.rivals import x264_lowdelay
 from rfedge.jobs import run_jobs
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -40,13 +36,6 @@ ROW_KEYS = {
     "rival_cpu_ms",
     "field_psnr_db",
 }
-
-
-class UsersCodec:
-    """What a user brings: a class that is called without arguments."""
-
-    def __new__(cls):
-        return x264_lowdelay("superfast", "users-codec")
 
 
 def test_a_drive_is_named_with_its_rate():
@@ -140,14 +129,6 @@ def compared(thumbnail, tmp_path_factory):
     job = job_of(thumbnail, folder, window=(33.0, 36.0), background=(thumbnail.empty,))
     console = Console(record=True, quiet=False, file=io.StringIO(), width=200)
     return job, run_compare(job, console), console.export_text()
-
-
-def test_a_comparison_says_what_it_will_do_before_it_starts(compared):
-    _, _, said = compared
-    first = said.splitlines()[0]
-    assert first.startswith("BD-rates over 33..36 dB: 83 clips to code, about ")
-    assert "Points are added where a curve does not span the window" in said
-    assert re.search(r"rfedge-fast-\w+ also at 41", said)
 
 
 def test_every_curve_spans_the_window_that_was_asked_for(compared):
@@ -255,19 +236,6 @@ def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbn
     assert not job.out.exists()
 
 
-@pytest.mark.parametrize(
-    ("options", "window"), [((), None), (("--window", "30", "34.5"), (30.0, 34.5))]
-)
-def test_the_command_takes_a_window(tmp_path, monkeypatch, options, window):
-    monkeypatch.chdir(tmp_path)
-    Path("wall.rff").touch()
-    jobs = []
-    monkeypatch.setattr(compare_run, "run_compare", lambda job, _console: jobs.append(job))
-    command = tyro.cli(EvalCompare, args=["wall.rff", "wall@10=drive.json", *options])
-    command.run()
-    assert [job.window for job in jobs] == [window]
-
-
 def test_a_background_without_its_drive_is_refused(thumbnail, tmp_path):
     elsewhere = thumbnail.empty.replace("wall@10", "alley@10")
     with pytest.raises(InvalidInput, match="alley"):
@@ -325,30 +293,3 @@ def test_a_rival_that_nobody_knows_is_refused_with_those_there_are(thumbnail, tm
     job = job_of(thumbnail, tmp_path, rivals=("h264",))
     with pytest.raises(InvalidInput, match="rivals: 'h264' is none of x264-lowdelay, x264-lowd"):
         run_compare(job, Console(quiet=True))
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_a_quick_comparison_writes_rows_and_goes_on_from_its_cells(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "users_module", sys.modules[__name__])
-    job = EvalCompare(
-        field=SAMPLES / "fields" / "street.rff",
-        drives=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
-        effort="fast",
-        preset="veryfast",
-        out=tmp_path / "compare.json",
-        cells=tmp_path / "cells",
-        method=("users_module:UsersCodec",),
-        quick=True,
-    )
-    first = run_compare(job, Console(quiet=True))
-    cells = {path: path.read_bytes() for path in job.cells.iterdir()}
-    again = run_compare(job, Console(quiet=True))
-    assert again["rows"] == first["rows"]
-    assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
-    assert json.loads(job.out.read_text())["rows"] == first["rows"]
-    assert all(set(row) >= ROW_KEYS for row in first["rows"])
-    rivals = {row["rival"] for row in first["rows"]}
-    assert {"x264-lowdelay", "svtav1-lowdelay", "users-codec", BEST} <= rivals
-    headline = next(r for r in first["rows"] if r["rival"] == "x264-lowdelay")
-    assert headline["bd_rate_percent"] < 0

@@ -86,11 +86,6 @@ def test_without_the_field_nothing_is_rendered_and_nothing_of_it_is_referred_to(
     assert (clip.cpu_ms, clip.receiver_cpu_ms) == (7, 3)
 
 
-def test_without_rendering_there_is_still_coding_to_be_timed():
-    seen = replace(render_clip(street(2), CAMERAS), render_cpu_ms=0.0)
-    assert FieldCoder(seen, "ours", "test", effort="fast").code(FRAMES, 10, 30.0).cpu_ms > 0
-
-
 def test_squared_errors_of_the_foreground_are_noted_frame_by_frame():
     everything = [np.ones(frame.y.shape, bool) for frame in FRAMES]
     clip = coded(street(2), foregrounds=everything)

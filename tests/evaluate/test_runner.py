@@ -160,8 +160,3 @@ def test_a_run_writes_its_result_and_prints_the_tables_of_it(tmp_path):
     assert said.getvalue().startswith("[bold]half done\n")
     assert "render" in said.getvalue()
     assert "words" not in said.getvalue()
-
-
-def test_a_result_that_is_no_json_file_is_refused(tmp_path):
-    with pytest.raises(InvalidInput, match=r"must end in \.json"):
-        Experiment(out=tmp_path / "x.txt", cells=tmp_path)

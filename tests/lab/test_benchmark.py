@@ -19,7 +19,6 @@ from lab.benchmark.definition import (
     V1,
     Benchmark,
     BenchmarkDrive,
-    described,
     print_scores,
     read_benchmark,
     record_anchors,
@@ -125,12 +124,6 @@ def test_v1_scores_as_it_did_when_it_was_frozen() -> None:
 
 
 GOLDEN_BD_RATE, GOLDEN_CI95 = -3.593759041767455, (-5.691207891814563, -1.9795819112294164)
-
-
-def test_the_definition_is_described() -> None:
-    text = described(read_benchmark())
-    assert "low_delay: The packet of frame k is made from frames 0 to k" in text
-    assert "kitti-loop: 64 frames, 820x248, 10 Hz, optional" in text
 
 
 def test_anchors_that_were_changed_are_refused(tmp_path: Path) -> None:
@@ -525,11 +518,6 @@ def test_our_own_coder_goes_through_the_same_door(
     check_decoder(Command(decode, DECODER_NEEDS), point, drive, tmp_path / "ours" / "prior")
     x264 = small.anchor_clips["wall", small.anchors[0].name]
     assert sum(point.frame_bytes) < max(int(clip.frame_bytes.sum()) for clip in x264)
-
-
-def test_the_command_line_shows_the_definition(capsys: pytest.CaptureFixture[str]) -> None:
-    parse(["benchmark", "show"]).run()
-    assert "rfedge-bench v1, definition " in capsys.readouterr().out
 
 
 def test_the_command_line_names_drives_by_example() -> None:

@@ -84,14 +84,6 @@ def block(vehicles: Any, entries_per_s: float = 0.0) -> TrafficBlock:
 # --- the file
 
 
-def test_the_sample_is_a_city() -> None:
-    town = read_city(SAMPLE)
-    assert town.servers.names == ("station", "harbour")
-    assert town.cells.server.tolist() == [0, 0, 1]
-    assert town.cells.uplink_bps.tolist() == [86.9e6, 86.9e6, 2.5e6]
-    assert town.density is not None
-
-
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -138,12 +130,6 @@ def test_a_grid_has_hexagons_of_mean_weight_one() -> None:
     away_m[np.diag_indices(100)] = np.inf
     assert away_m.min() == pytest.approx(Assumptions().inter_site_m)
     assert (away_m < 1.01 * away_m.min()).sum(axis=1).max() == 6
-
-
-def test_bytes_grow_with_what_the_field_has_never_seen() -> None:
-    shares = (0.0, TABLES_MOVING_PERCENT / 2, TABLES_MOVING_PERCENT)
-    factors = [VehicleKind(DEMAND, percent).bytes_factor for percent in shares]
-    assert factors == pytest.approx([factors[0], (factors[0] + 1) / 2, 1.0])
 
 
 def test_what_the_field_has_never_seen_costs_what_the_recorded_comparison_says() -> None:
@@ -293,11 +279,6 @@ def test_waits_are_those_of_periodic_sources(others: int, load: float) -> None:
     for chance in (0.9, 0.99):
         told = queue_wait(np.array([chance]), np.array([others * 1.0]), np.array([load]), 0.0)[0]
         assert told == pytest.approx(np.quantile(waits, chance), rel=0.3, abs=0.7)
-
-
-def test_who_is_alone_waits_for_nobody() -> None:
-    wait = queue_wait(np.array([0.999]), np.array([0.0]), np.array([0.9]), 0.2)
-    assert wait[0] == 0.0
 
 
 def shared(vehicles: float, **changes: float) -> SharedLoad:

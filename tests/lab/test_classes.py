@@ -186,15 +186,6 @@ def test_a_quality_that_several_points_have_is_had_for_the_fewest_bytes() -> Non
     assert longer.bytes_at(last.psnr_db()) == pytest.approx(90)
 
 
-def test_a_row_has_the_keys_of_the_file_and_comes_back() -> None:
-    row = ClassQuality("alley", 10.0, "ours", "vehicle", 31.5, 7.0, "bits", 33.5, 900.0)
-    assert row.row()["class"] == "vehicle"
-    assert row.row().keys() >= {"scene", "hz", "method", "class", "psnr_db", "share_percent"}
-    assert ClassQuality.of_rows([json.loads(json.dumps(row.row()))]) == [row]
-    with pytest.raises(InvalidInput, match="row 0 lacks"):
-        ClassQuality.of_rows([{"scene": "alley"}])
-
-
 def write_classes(folder: Path, labels: np.ndarray) -> None:
     """Write a class picture as PNG of one channel."""
     folder.parent.mkdir(exist_ok=True)

@@ -36,12 +36,6 @@ def test_twice_the_noise_moves_each_camera_twice_as_far():
     np.testing.assert_allclose(more, 2 * turned, rtol=1e-3)
 
 
-def test_no_noise_moves_nothing():
-    metres, degrees = moved(PoseNoise())
-    assert metres.max() < 1e-12
-    assert degrees.max() < 1e-5
-
-
 def clip(kbit, psnr_db):
     mse = 255.0**2 / 10 ** (psnr_db / 10)
     sizes = np.array([10**6, 125 * kbit, 125 * kbit])

@@ -14,7 +14,6 @@ from lab.latency.run import (
     REQUIREMENT,
     needed_rate_bps,
     play,
-    repeated,
     run_latency,
 )
 from rfcore.errors import InvalidInput
@@ -40,13 +39,6 @@ def test_a_frame_waits_for_the_one_before_and_a_third_is_dropped():
     assert played.frames == 4
 
 
-def test_dropped_frames_are_late_in_shares_and_quantiles():
-    played = play([2500] * 4, 100, constant(1e6))
-    assert played.share_within(25) == 0.25
-    assert played.quantile_ms(0.5) == pytest.approx(40)
-    assert played.quantile_ms(1.0) == np.inf
-
-
 @pytest.mark.parametrize("budget_ms", [5.0, 10.0])
 def test_the_needed_rate_sends_the_largest_frame_within_the_budget(budget_ms):
     sizes = [1000] * 90 + [4000] * 10
@@ -66,12 +58,6 @@ def test_a_budget_that_nothing_meets_is_an_error():
         needed_rate_bps([10**9], 10, 1e-3)
 
 
-def test_a_clip_is_repeated_without_the_frame_that_is_sent_once():
-    assert repeated([9, 1, 2], 5) == [1, 2, 1, 2, 1]
-    with pytest.raises(InvalidInput, match="at least two frames"):
-        repeated([9], 5)
-
-
 def test_the_requirement_takes_three_hundred_thousand_frames():
     """So many in a row without a late one have a chance of 5 % where the true share is 99.999 %."""
     assert REQUIREMENT**FRAMES_FOR_REQUIREMENT <= 0.05 < REQUIREMENT ** (FRAMES_FOR_REQUIREMENT - 1)
@@ -84,12 +70,6 @@ def test_on_a_link_that_is_quick_enough_nothing_waits_and_nothing_is_dropped(rat
     played = play(sizes, rate_hz, constant(8 * 2000 * rate_hz))
     assert played.dropped == 0
     np.testing.assert_allclose(played.network_ms, played.tau_ms, rtol=1e-9)
-
-
-def test_twice_the_rate_halves_tau():
-    sizes = [500, 2000, 800]
-    slow, fast = (play(sizes, 1, constant(rate)).tau_ms for rate in (1e6, 2e6))
-    np.testing.assert_allclose(slow, 2 * fast)
 
 
 def test_no_latency_is_below_its_transmission_and_propagation():

@@ -118,13 +118,3 @@ def test_a_drive_may_ask_for_searches_from_one_start_error_alone() -> None:
 def test_a_drive_without_a_field_is_refused() -> None:
     with pytest.raises(InvalidInput, match="NAME=DRIVE,FIELD"):
         EvalLocalise(drives=("sample=here",)).run()
-
-
-def test_a_sensor_of_another_form_is_refused_before_any_work() -> None:
-    with pytest.raises(InvalidInput, match="whichever"):
-        EvalLocalise(drives=("a=d.json,f.rff",), errors=("whichever",)).run()
-
-
-def test_a_number_of_processes_that_cannot_be_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="processes: 0 is outside"):
-        EvalLocalise(drives=("a=b,c",), processes=0)

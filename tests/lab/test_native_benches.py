@@ -15,7 +15,6 @@ from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.opencl import open_device
 from rfcore.views import View
-from rfedge import timing
 from rfedge.results import write_result
 
 RASTER_KEYS = [
@@ -108,20 +107,6 @@ def test_a_wrong_renderer_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unknown_case_is_refused_by_name() -> None:
     with pytest.raises(InvalidInput, match="'speed' is not one of raster, train, codec"):
         run_case("speed")
-
-
-def test_a_median_takes_every_repetition_but_not_the_warm_up() -> None:
-    calls: list[None] = []
-    assert timing.median_ms(lambda: calls.append(None), repetitions=5) >= 0
-    assert len(calls) == 5 + timing.WARM_UP
-    assert timing.REPETITIONS >= 20
-
-
-def test_the_street_has_the_density_it_promises() -> None:
-    """47 +- 3 useful blends per pixel at every size; a quarter of the 640x360 bench here."""
-    statistics = Rasterizer(street_gaussians()).statistics(street_camera(320, 180))
-    assert statistics.blends_per_px == pytest.approx(47, abs=3)
-    assert statistics.visible == pytest.approx(130_300, rel=0.01)
 
 
 def test_every_coder_has_its_row_at_each_number_of_references(

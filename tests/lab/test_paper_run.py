@@ -20,11 +20,8 @@ from lab.paper.report import (
 )
 from lab.paper.run import named_path, run_paper, views_of
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.runner import Run
 from rfedge.evaluate.savings import intra_alone
 from rfedge.results import as_json
-
-SAMPLES = Path(__file__).parents[2] / "samples"
 
 
 def row(frame, crf, savings, **other):
@@ -249,23 +246,6 @@ def test_a_run_stopped_after_a_cell_goes_on_from_it(paper):
     assert cells[0].exists()
 
 
-def test_what_is_left_is_told_by_a_picture_with_all_its_sizes(paper, tmp_path, monkeypatch, capsys):
-    """Not by the first size, which would be charged for the reading and the render at full size."""
-    job, _ = paper
-    clock_s = iter((0.0, 60.0))
-    monkeypatch.setattr(run, "monotonic", lambda: next(clock_s))
-    done = []
-    monkeypatch.setattr(run, "_rows", lambda piece: done.append(piece) or [])
-    pictures = run._by_picture(job, list(run._shots(job, run._opened(job))))
-    assert [len(pieces) for pieces in pictures] == [2, 2], "of two frames at two sizes"
-    begun = Run.begin("paper", replace(job, cells=tmp_path), (), Console(width=100))
-    run._say_cost(pictures, begun, processes=1)
-    assert done == pictures[0]
-    assert capsys.readouterr().out == "2 pictures, 2 left, about 1.0 minutes\n"
-    run._say_cost(pictures[:1], begun, processes=1)
-    assert capsys.readouterr().out == "1 pictures, nothing left to do\n"
-
-
 def test_several_processes_code_the_same(paper, tmp_path):
     job, result = paper
     elsewhere = replace(job, processes=2, cells=tmp_path / "cells", out=tmp_path / "b.json")
@@ -296,25 +276,11 @@ def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
         EvalPaper(**({"fields": ("a=b",), "drives": ("c=d",)} | change))
 
 
-@pytest.mark.slow
-@pytest.mark.sample
-def test_a_quick_run_gives_the_published_rows_and_its_controls(tmp_path):
-    job = EvalPaper(
-        fields=(f"3dgs={SAMPLES / 'fields' / 'street.rff'}",),
-        drives=(f"empty={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
-        sizes=("300x168",),
-        out=tmp_path / "paper.json",
-        cells=tmp_path / "cells",
-        quick=True,
+def test_a_scene_that_was_not_published_has_a_plain_name(tmp_path):
+    paths = write_paper_figures(
+        result_of([replace(r, scene="night") for r in ROWS]), tmp_path, "paper"
     )
-    result = run_paper(job, Console(quiet=True))
-    assert result == json.loads(job.out.read_text())
-    assert run_paper(job, Console(quiet=True))["tables"] == result["tables"]
-    means = means_of(paper_rows(result))
-    means = {(mean.name, mean.making): mean.savings_percent for mean in means}
-    field = means["3dgs", "native"]
-    assert field > means["3dgs:behind", "native"] > 0
-    assert field > means["3dgs:grey", "native"]
+    assert "savings_night_3dgs.svg" in {path.name for path in paths}
 
 
 def test_views_stand_side_by_side(tmp_path):
@@ -323,10 +289,3 @@ def test_views_stand_side_by_side(tmp_path):
     drawing, numbers = write_views(views, tmp_path)
     assert drawing.name == "fig2_views.svg"
     assert "a: camera,32,18" in numbers.read_text()
-
-
-def test_a_scene_that_was_not_published_has_a_plain_name(tmp_path):
-    paths = write_paper_figures(
-        result_of([replace(r, scene="night") for r in ROWS]), tmp_path, "paper"
-    )
-    assert "savings_night_3dgs.svg" in {path.name for path in paths}

@@ -9,12 +9,8 @@ import pytest
 from rich.console import Console
 
 from lab.robust import EvalRobust
-from lab.robust.report import write_robust_figure
 from lab.robust.run import _interval, run_robust
 from rfcore.errors import InvalidInput
-
-SAMPLES = Path(__file__).parents[2] / "samples"
-
 
 QUALITY_DB = 40.0
 
@@ -142,39 +138,6 @@ def test_the_interval_of_a_mean_is_near_what_a_normal_distribution_has():
     low, high = _interval(values)
     assert (low + high) / 2 == pytest.approx(values.mean(), abs=2e-4)
     assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(400), rel=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_a_quick_run_writes_rows_and_a_figure_and_goes_on(tmp_path):
-    drive = SAMPLES / "street/transforms_drive_empty.json"
-    job = EvalRobust(
-        drive=f"empty@10={drive}",
-        effort="fast",
-        preset="ultrafast",
-        frames=8,
-        out=tmp_path / "robust.json",
-        cells=tmp_path / "cells",
-        quick=True,
-    )
-    result = run_robust(job, Console(quiet=True))
-    assert json.loads(job.out.read_text()) == result
-    at = {(r["method"], r["rtt_ms"], r["loss_percent"]): r["ssim"] for r in result["rows"]}
-    assert at["last-sent", 20, 0] == pytest.approx(at["last-acked", 20, 0], abs=1e-3)
-    for method in ("last-sent", "last-acked", "render-only", "x264-idr-on-nack"):
-        assert at[method, 20, 0] > 0.7
-    noise = [r for r in result["disturbances"] if r["condition"] == "pose noise"]
-    assert noise[0]["more_percent"] == 0
-    assert noise[-1]["more_percent"] > 5, "10 cm and 0.1 degrees cost bits"
-    (refined,) = (r for r in result["disturbances"] if r["condition"] == "refined pose noise")
-    assert refined["level"] == noise[-1]["level"]
-    assert refined["more_percent"] < noise[-1]["more_percent"] / 2
-    assert refined["frames_found"] == 8
-    assert not any("frames_found" in row for row in noise), "where they were measured"
-    reasons = [r["reason"] for r in result["disturbances"] if "reason" in r]
-    assert ["--lane" in reasons[0], "--dusk" in reasons[1]] == [True, True]
-    assert len(write_robust_figure(result, tmp_path / "figures", "robust")) == 2
-    assert run_robust(job, Console(quiet=True))["rows"] == result["rows"]
 
 
 @pytest.mark.parametrize(
