@@ -288,7 +288,7 @@ async def test_the_page_shows_pictures_and_field_of_all_servers(
         await one.told(coded.frames[0])
         await until(lambda: ("cav-raw", "front") in scene.newest)
         await until(lambda: scene.field(street.field_id) is not None)
-        assert scene.newest["cav-raw", "front"].jpeg[:2] == b"\xff\xd8"
+        assert scene.newest["cav-raw", "front"].picture[:2] == b"\xff\xd8"
         await one.farewell()
         await until(lambda: not scene.newest)
     task.cancel()
