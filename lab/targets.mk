@@ -4,7 +4,7 @@
 
 ##@ Results
 results results-full: build-full  ## record anew what takes two hours, or everything (DATA)
-	$(MAKE) -f lab/results/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
+	$(MAKE) -f lab/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
 
 results-%: build-full  ## record `rfedge-lab NAME` in lab/results/NAME.json (ARGS)
 	$(BIN)/rfedge-lab $* $(ARGS) --out lab/results/$*.json

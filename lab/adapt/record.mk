@@ -1,5 +1,5 @@
 # Everything that lab/results/adapt.json compares, and the file:
-#     make -j2 -f samples/adapt/record.mk [DATA=FOLDER] [RESULT=out/adapt/adapt.json]
+#     make -j2 -f lab/adapt/record.mk [DATA=FOLDER] [RESULT=out/adapt/adapt.json]
 # Fields and layers are learnt from drives through the sample's street under other circumstances. With DATA, a
 # folder that has `street` and `kitti/city` (docs/explanation/evaluation.md), another street at dusk and a real one join.
 # What is there is not made again. Some seconds of a core a picture, three minutes a field: an hour on two cores.

@@ -1,4 +1,4 @@
-# What `rfedge eval` and `rfedge-lab bench` record in results/, on a quiet machine from a committed revision:
+# What `rfedge eval` and `rfedge-lab` record in lab/results, on a quiet machine from a committed revision:
 #     make results [DATA=FOLDER]         what takes two hours of two cores
 #     make results-full [DATA=FOLDER]    the rest, too, which takes days
 # DATA is a folder that has `street` (the yardstick), `kitti/city` and `kitti/loop` (docs/how-to/data.md); without it the
@@ -20,7 +20,7 @@ results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes
 	cp $^ lab/results/
 results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live world paper)
 	cp $(filter %.json,$^) lab/results/
-	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
+	$(MAKE) -f lab/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
 $(OUT):
 	mkdir -p $@
