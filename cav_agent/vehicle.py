@@ -49,7 +49,7 @@ from cav_agent.notices import NoticeSocket
 from cav_agent.pipeline import Pipeline, PipelineOptions
 from cav_agent.pose_feed.feed import PoseFeed
 from cav_agent.pose_feed.feed_poses import FeedPoses
-from cav_agent.pose_feed.placement import FieldPlacement
+from cav_agent.pose_feed.fix import FieldPlacement
 from cav_agent.pose_feed.sources import FeedKind, FeedTask
 from cav_agent.rate_control import BitDivision, RateControl
 from cav_agent.server_connection import WHOLE_STREET, ServerConnection, server_connections

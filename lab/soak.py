@@ -23,9 +23,9 @@ import tyro
 
 from lab.report import Report
 from rfcore.errors import InvalidInput, RfedgeError
+from rfedge.loadtest.drive import Sample
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.run import Run, TestBed, run_load
-from rfedge.loadtest.usage import Sample
 from rfedge.report.tables import Table, named_columns
 from rfedge.results import Result, make_result, provenance, write_result
 from rfedge.samples import sample_path

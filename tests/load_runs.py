@@ -2,9 +2,8 @@
 
 from dataclasses import replace
 
-from rfedge.loadtest.plan import Load, Mode
+from rfedge.loadtest.plan import Load, Mode, Verdict
 from rfedge.loadtest.run import LoadRow, Run
-from rfedge.loadtest.verdict import Verdict
 
 __all__ = ["load_run", "row_of"]
 

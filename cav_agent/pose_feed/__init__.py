@@ -8,8 +8,7 @@ clock. Other packages import the names below.
 
 from cav_agent.pose_feed.feed import PoseFeed
 from cav_agent.pose_feed.feed_poses import FeedPoses, recorded_time_ns
-from cav_agent.pose_feed.fix import FeedProblem
-from cav_agent.pose_feed.placement import CameraMount, FieldPlacement
+from cav_agent.pose_feed.fix import CameraMount, FeedProblem, FieldPlacement
 from cav_agent.pose_feed.sources import parse_source
 
 __all__ = [

@@ -27,8 +27,7 @@ import numpy as np
 from cav_agent.camera_poses import PoseSource
 from cav_agent.frames import Capture
 from cav_agent.pose_feed.feed import FASTEST_MPS, NS, SIGMAS, PoseFeed
-from cav_agent.pose_feed.fix import FeedProblem, Fix
-from cav_agent.pose_feed.placement import FieldPlacement
+from cav_agent.pose_feed.fix import FeedProblem, FieldPlacement, Fix
 from rfcore.camera import Camera, Pose, Vec3
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import Bounds

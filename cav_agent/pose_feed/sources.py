@@ -18,8 +18,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from cav_agent.pose_feed.feed import PoseFeed
-from cav_agent.pose_feed.fix import FeedProblem
-from cav_agent.pose_feed.placement import CameraMount
+from cav_agent.pose_feed.fix import CameraMount, FeedProblem
 from rfcore.errors import InvalidInput
 
 __all__ = ["FeedKind", "FeedSource", "FeedTask", "PoseFeedSettings", "parse_source"]

@@ -28,7 +28,7 @@ from lab.twin_reader import reading
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable, RfedgeError
 from rfcore.image import jpeg_bytes
-from rfedge.loadtest.usage import Usage, Watcher
+from rfedge.loadtest.drive import Usage, Watcher
 from rfedge.processes import command_of, service
 from rfedge.report.tables import print_tables
 from rfedge.results import CHECKOUT, make_result, provenance, write_result

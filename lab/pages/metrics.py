@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry
 from cav_agent import vehicle
 from mec_server import server
 from rfcore.wire.instruments import Family
-from rfedge.link.metrics import LinkMetrics
+from rfedge.link.direction import LinkMetrics
 
 __all__ = ["families"]
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from lab.servers import EvalScale
 from lab.servers.cases import Case, Measured, RayTiles, ScaleRow
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.datasets.split import LIST_NAME, read_tiles
+from rfedge.datasets.convert import LIST_NAME, read_tiles
 from rfedge.processes import command_of
 
 __all__ = ["TileRun", "overhead_percent", "ray_case", "require_resumed", "train_tiles"]

@@ -33,9 +33,8 @@ from rfcore.wire.notices import ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.twin_render import ViewRequest
-from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S
+from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S, PrerecordedVehicle
 from rfedge.loadtest.prerecorded import PrerecordedDrive, Schedule, prerecorded_drive
-from rfedge.loadtest.vehicle import PrerecordedVehicle
 from rfedge.processes import command_of
 from rfedge.report.tables import print_tables
 from rfedge.results import (

@@ -76,7 +76,7 @@ class DatasetSplit:
 
     def run(self) -> None:
         """Split; the folder appears when all of it is there."""
-        from rfedge.datasets.split import SplitSettings, split_dataset
+        from rfedge.datasets.convert import SplitSettings, split_dataset
 
         settings = SplitSettings(self.length, self.overlap, self.fewest, self.points_within)
         for tile in split_dataset(self.dataset, self.out, settings):

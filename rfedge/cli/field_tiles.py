@@ -14,7 +14,7 @@ from rfedge.arguments import FIELD, FOLDER, field_path
 if TYPE_CHECKING:
     from rfcore.wire.tile_manifest import Publication, VersionLabel
     from rfcore.wire.tiles import Tile
-    from rfedge.datasets.split import SplitTile
+    from rfedge.datasets.convert import SplitTile
 
 __all__ = ["FieldList", "FieldPublish", "FieldRollback"]
 
@@ -54,7 +54,7 @@ class FieldPublish:
         from rfcore.wire.publish import Ground, publish
         from rfcore.wire.tile_manifest import VersionLabel
         from rfcore.wire.tiles import Area
-        from rfedge.datasets.split import read_tiles
+        from rfedge.datasets.convert import read_tiles
 
         tiles = read_tiles(self.field)
         if tiles is not None:

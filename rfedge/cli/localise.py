@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rfcore.field import RadianceField
     from rfcore.localise.prior import PosePrior
     from rfcore.views import PosedPicture
-    from rfedge.localisation.feed import RecordedFeed
+    from rfedge.localisation.searches import RecordedFeed
 
 __all__ = ["Localise"]
 
@@ -62,13 +62,13 @@ class Localise:
         from rich.progress import track
 
         from rfcore.dataset import read_dataset
-        from rfedge.localisation.feed import typical_start
         from rfedge.localisation.report import write_localise_report
         from rfedge.localisation.searches import (
             SearchSummary,
             parse_start_error,
             searches_from,
             searches_from_displaced,
+            typical_start,
             write_poses,
         )
         from rfedge.results import make_result, provenance, write_result
@@ -106,7 +106,7 @@ class Localise:
 
     def _feed(self) -> RecordedFeed:
         from rfcore.errors import InvalidInput
-        from rfedge.localisation.feed import RecordedFeed
+        from rfedge.localisation.searches import RecordedFeed
 
         assert self.pose_feed is not None
         if self.tries is not None:

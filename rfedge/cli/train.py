@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rfcore.dataset import Dataset
     from rfcore.field import RadianceField
     from rfcore.train import NgpTrainingConfig, SplatTrainingConfig
-    from rfedge.datasets.split import SplitTile
+    from rfedge.datasets.convert import SplitTile
     from rfedge.jobs import Job, Tell
     from rfedge.training.run import Trained, TrainingJob
     from rfedge.training.view import Snapshots
@@ -123,7 +123,7 @@ class Train:
         from rich.console import Console
 
         from rfcore.errors import InvalidInput
-        from rfedge.datasets.split import read_tiles
+        from rfedge.datasets.convert import read_tiles
 
         tiles = read_tiles(self.dataset)
         if tiles is not None:
@@ -174,7 +174,7 @@ class Train:
         import shutil
 
         from rfcore.extras import require
-        from rfedge.datasets.split import LIST_NAME
+        from rfedge.datasets.convert import LIST_NAME
         from rfedge.jobs import run_jobs
 
         self._require_tile_options()
@@ -243,7 +243,7 @@ class Train:
             yield made
 
     def _write_poses(self, job: TrainingJob, trained: Trained, console: Console) -> None:
-        from rfedge.training.refined_poses import write_refined_poses
+        from rfedge.training.run import write_refined_poses
 
         if trained.aligned is not None:
             aligned_db = trained.aligned.psnr_db

@@ -36,8 +36,7 @@ from rfcore.files import write_whole
 from rfcore.link import DirectionPlan, LinkPlan, LinkProfile, read_link
 from rfcore.wire.address import Address
 from rfcore.wire.instruments import MetricsEndpoint
-from rfedge.link.direction import SPIN_S, Direction
-from rfedge.link.metrics import LinkMetrics
+from rfedge.link.direction import SPIN_S, Direction, LinkMetrics
 
 __all__ = ["LinkProxy", "ProxySettings", "Side", "run_proxy"]
 

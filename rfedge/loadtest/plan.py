@@ -1,16 +1,42 @@
-"""The plan of a load test: the load on a server, and the bounds within which it is held."""
+"""The load on a server, the bounds within which it is held, and the verdict on a run.
+
+A frame is on time when its Ack arrives within the deadline, counted from the moment the picture
+was due. Frames that were dropped, refused or not answered are late.
+
+Every resource has a utilisation above which work queues up for it. If a bound was broken, the first
+resource above its limit is named, otherwise the resource nearest to its limit. The load generator
+comes first: where the test's own vehicles are the limit, the run says nothing about the server.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from statistics import NormalDist
+
+import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import MAX_CAMERAS, MAX_PAYLOAD_BYTES
 from rfcore.wire.settings import RenderSettings
 
-__all__ = ["Bounds", "Load", "Mode", "Vehicles"]
+__all__ = [
+    "Bounds",
+    "Load",
+    "Measured",
+    "Mode",
+    "Resources",
+    "VehicleReport",
+    "Vehicles",
+    "Verdict",
+    "judge",
+    "limit",
+    "nearest",
+    "share_at_least",
+]
 
 
 class Mode(StrEnum):
@@ -116,3 +142,223 @@ class Load:
             raise InvalidInput("live", f"live vehicles need mode full, not {self.mode}")
         if self.cameras != 1:
             raise InvalidInput("cameras", f"{self.cameras}: a live vehicle has one camera")
+
+
+BUSY = 0.85
+"""Utilisation of a core, a link or a worker above which work queues up.
+
+At 85 % the mean queue of an M/D/1 server is already three services long."""
+MACHINE_BUSY = 0.95
+OTHERS = 0.3
+"""Cores used by other processes above which a run is not that of an idle machine."""
+LAG_MS = 20.0
+"""Lateness of the generator's event loop above which the run measures the generator itself."""
+
+
+@dataclass(frozen=True)
+class Resources:
+    """The utilisation of every resource, 0..1, and how late the generator was."""
+
+    server_loop: float
+    """The server's event loop, as a share of one core."""
+    workers: float
+    """The server's other threads, as a share of the cores that they can have."""
+    link: float
+    """The uplink of the busiest vehicle."""
+    generator: float
+    """The busiest process that plays vehicles or links, as a share of one core; 0 for live
+    vehicles, which are a part of what is tested."""
+    machine: float
+    """All cores of the machine."""
+    test: float
+    """The share of the machine that the test's own processes used."""
+    others: float
+    """Cores that other processes used."""
+    generator_lag_ms: float
+
+
+@dataclass(frozen=True)
+class Utilisation:
+    """Utilisation of one resource, its limit, and a text for both."""
+
+    text: str
+    share: float
+    limit: float
+
+    @property
+    def is_over(self) -> bool:
+        """Whether work queued up for it."""
+        return self.share > self.limit
+
+
+def limit(resources: Resources) -> str:
+    """Name the first resource above its limit, or the one nearest to it, with its utilisation."""
+    r = resources
+    machine = Utilisation(
+        f"CPU of the machine, at {_percent(r.machine)}{_beside(r)}", r.machine, MACHINE_BUSY
+    )
+    uses = (_lag(r), *_on_one_core(r), machine, _workers(r))
+    over = next((use for use in uses if use.is_over), None)
+    return over.text if over is not None else f"nearest: {_fullest(uses)}"
+
+
+def nearest(resources: Resources) -> str:
+    """Name the resource that limits a load that was held, with its utilisation.
+
+    Other processes on the machine are left out, since they are no part of the test.
+    """
+    r = resources
+    machine = Utilisation(f"CPU of the machine, at {_percent(r.test)}", r.test, MACHINE_BUSY)
+    return f"nearest: {_fullest((*_on_one_core(r), machine, _workers(r)))}"
+
+
+def _fullest(uses: Sequence[Utilisation]) -> str:
+    return max(uses, key=lambda use: use.share / use.limit).text
+
+
+def _on_one_core(r: Resources) -> tuple[Utilisation, ...]:
+    shares = (
+        ("vehicles of the test, at {} of a core", r.generator),
+        ("link of the busiest vehicle, at {}", r.link),
+        ("server's event loop, at {} of a core", r.server_loop),
+    )
+    return tuple(Utilisation(text.format(_percent(share)), share, BUSY) for text, share in shares)
+
+
+def _workers(r: Resources) -> Utilisation:
+    return Utilisation(f"server's workers, at {_percent(r.workers)}", r.workers, BUSY)
+
+
+def _lag(r: Resources) -> Utilisation:
+    """Return the lateness of the generator, or 0 if the whole machine was busy."""
+    late = r.generator_lag_ms if r.machine < MACHINE_BUSY else 0.0
+    return Utilisation(f"vehicles of the test, {late:.0f} ms late themselves", late, LAG_MS)
+
+
+def _beside(r: Resources) -> str:
+    return f", {r.others:.1f} cores of it by others" if r.others > OTHERS else ""
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+DEVIATIONS = NormalDist().inv_cdf(0.975)
+"""Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
+
+
+@dataclass(frozen=True)
+class VehicleReport:
+    """One vehicle in the measured part of a run."""
+
+    due: int
+    """Number of pictures that were due."""
+    latency_ms: Sequence[float]
+    """Latencies of the pictures that were acknowledged."""
+    nacked: int = 0
+    """Number of pictures that the server refused."""
+    granted_hz: float = 0.0
+    """Rate that the server admitted; 0: any."""
+    refused: str = ""
+    """Why the server did not admit the vehicle; empty if it did."""
+    failed: str = ""
+    """Why the vehicle lost its stream; empty if it did not."""
+
+    def on_time(self, deadline_ms: float) -> int:
+        """Return how many pictures were acknowledged within the deadline."""
+        return sum(ms <= deadline_ms for ms in self.latency_ms)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The measurements of one run that are judged."""
+
+    vehicles: Sequence[VehicleReport]
+    wanted_vehicles: int
+    growth_mb: float
+    """Growth of the server's memory over ``minutes``."""
+    minutes: float
+    resources: Resources
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The judgement of one run."""
+
+    broken: Sequence[str]
+    """The bounds that were not kept; the load is held if there are none."""
+    p50_ms: float
+    p99_ms: float
+    on_time_percent: float
+    on_time_at_least_percent: float
+    fairness: float
+    limited_by: str
+
+    @property
+    def held(self) -> bool:
+        """Whether every bound was kept."""
+        return not self.broken
+
+
+def judge(measured: Measured, bounds: Bounds) -> Verdict:
+    """Compare a run with its bounds."""
+    due = sum(vehicle.due for vehicle in measured.vehicles)
+    on_time = sum(vehicle.on_time(bounds.deadline_ms) for vehicle in measured.vehicles)
+    latency_ms = [ms for vehicle in measured.vehicles for ms in vehicle.latency_ms]
+    p50_ms, p99_ms = _percentiles(latency_ms)
+    percent = 100.0 * on_time / due if due else 0.0
+    fairness = _fairness(measured.vehicles, bounds.deadline_ms)
+    allowed_mb = bounds.settling_mb + bounds.growth_mb_per_minute * measured.minutes
+    checks = (
+        (
+            len(measured.vehicles) < measured.wanted_vehicles,
+            f"{measured.wanted_vehicles - len(measured.vehicles)} vehicles were not admitted",
+        ),
+        (p99_ms > bounds.deadline_ms, f"p99 {p99_ms:.0f} ms above {bounds.deadline_ms:g} ms"),
+        (
+            percent < bounds.on_time_percent,
+            f"{percent:.2f} % on time, below {bounds.on_time_percent:g} %",
+        ),
+        (fairness < bounds.fairness, f"fairness {fairness:.2f} below {bounds.fairness:g}"),
+        (
+            measured.growth_mb > allowed_mb,
+            f"memory grew {measured.growth_mb:.1f} MB, {allowed_mb:.1f} may be",
+        ),
+    )
+    broken = tuple(problem for is_broken, problem in checks if is_broken)
+    return Verdict(
+        broken=broken,
+        p50_ms=p50_ms,
+        p99_ms=p99_ms,
+        on_time_percent=percent,
+        on_time_at_least_percent=100.0 * share_at_least(on_time, due),
+        fairness=fairness,
+        limited_by=(limit if broken else nearest)(measured.resources),
+    )
+
+
+def share_at_least(successes: int, trials: int) -> float:
+    """Return the lower end of Wilson's 95 % interval of a share; 0 without trials.
+
+    Frames of one vehicle are late together, so the true interval is wider.
+    """
+    if not trials:
+        return 0.0
+    share, spread = successes / trials, DEVIATIONS**2 / trials
+    half = math.sqrt(spread * (share * (1 - share) + spread / 4))
+    return max(0.0, (share + spread / 2 - half) / (1 + spread))
+
+
+def _percentiles(latency_ms: Sequence[float]) -> tuple[float, float]:
+    """Return the 50th and the 99th percentile; infinity of an empty list."""
+    if not latency_ms:
+        return math.inf, math.inf
+    p50_ms, p99_ms = np.percentile(np.array(latency_ms), (50, 99))
+    return float(p50_ms), float(p99_ms)
+
+
+def _fairness(vehicles: Sequence[VehicleReport], deadline_ms: float) -> float:
+    """Return the worst vehicle's share on time over the best one's."""
+    shares = [vehicle.on_time(deadline_ms) / vehicle.due for vehicle in vehicles if vehicle.due]
+    best = max(shares, default=0.0)
+    return min(shares) / best if best else 0.0

@@ -15,15 +15,14 @@ from rfcore.field import load_field
 from rfcore.raster.renderers import CPU
 from rfedge.loadtest.drive import (
     RunMeasurements,
+    Usage,
     drive_live,
     drive_prerecorded,
     links_busy,
     measured,
 )
-from rfedge.loadtest.plan import Load, Mode, Vehicles
+from rfedge.loadtest.plan import Load, Mode, Vehicles, Verdict, judge
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
-from rfedge.loadtest.usage import Usage
-from rfedge.loadtest.verdict import Verdict, judge
 from rfedge.processes import Service, command_of, service
 
 __all__ = ["LoadRow", "Run", "TestBed", "recorded", "run_load"]

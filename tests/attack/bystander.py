@@ -33,8 +33,8 @@ from rfcore.wire.twin import (
     twin_message_from_wire,
 )
 from rfcore.wire.v1 import twin_pb2_grpc
+from rfedge.loadtest.fleet import PrerecordedVehicle, wall_ns
 from rfedge.loadtest.prerecorded import End, PrerecordedDrive, Schedule, Shot
-from rfedge.loadtest.vehicle import PrerecordedVehicle, wall_ns
 
 NAME, NEWCOMER = "bystander", "newcomer"
 HZ = 10.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError, InvalidInput
-from rfedge.datasets.split import SplitSettings, read_tiles, split_dataset, tiles_of
+from rfedge.datasets.convert import SplitSettings, read_tiles, split_dataset, tiles_of
 
 FAR_M = (500_000.0, 300.0)
 """Where the recording is in its world, so that readers choose an origin near it."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from lab.soak import what_grew
-from rfedge.loadtest.usage import Sample
+from rfedge.loadtest.drive import Sample
 
 
 def looks(slope_mb: float = 0.0, **late: int) -> list[Sample]:

@@ -5,7 +5,7 @@ import threading
 import psutil
 import pytest
 
-from rfedge.loadtest.usage import Sample, Usage, sample
+from rfedge.loadtest.drive import Sample, Usage, sample
 
 
 def samples_of(rss_mb: list[float]) -> list[Sample]:

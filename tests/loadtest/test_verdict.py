@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from rfedge.loadtest.plan import Bounds
-from rfedge.loadtest.verdict import (
+from rfedge.loadtest.plan import (
+    Bounds,
     Measured,
     Resources,
     VehicleReport,

@@ -23,9 +23,9 @@ from rfcore.motion import rotation_vector
 from rfcore.views import PosedPicture
 from rfedge.cli.dataset import DatasetConvert
 from rfedge.cli.localise import Localise
-from rfedge.localisation.feed import RecordedFeed
 from rfedge.localisation.report import write_localise_report
 from rfedge.localisation.searches import (
+    RecordedFeed,
     SearchOutcome,
     SearchSummary,
     StartError,

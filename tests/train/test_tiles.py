@@ -16,7 +16,7 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.tile_manifest import read_publication
 from rfedge.cli.field_tiles import FieldPublish
 from rfedge.cli.train import Train
-from rfedge.datasets.split import SplitSettings, split_dataset
+from rfedge.datasets.convert import SplitSettings, split_dataset
 
 OPTIONS = {"iterations": 60, "gaussians": 200, "threads": 1, "plain": True, "checkpoint_every": 20}
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from cav_agent.pose_feed.feed import NS, QUIET_S, PoseFeed
 from cav_agent.pose_feed.feed_poses import FeedPoses, TimeOffsetEstimator
-from cav_agent.pose_feed.fix import FeedProblem, Fix
-from cav_agent.pose_feed.placement import CameraMount, FieldPlacement
+from cav_agent.pose_feed.fix import CameraMount, FeedProblem, FieldPlacement, Fix
 from cav_agent.pose_feed.sources import FeedKind, FeedSource, PoseFeedSettings, parse_source
 from lab.localisation.pose_errors import ERROR_MODELS, PoseErrorModel
 from lab.localisation.pose_feed import FeedPlan, feed_lines

@@ -10,7 +10,7 @@ import pytest
 from cav_agent.frames import Capture
 from cav_agent.pose_feed.feed import NS, PoseFeed
 from cav_agent.pose_feed.feed_poses import LONGEST_CARRY_S, FeedPoses
-from cav_agent.pose_feed.placement import FieldPlacement
+from cav_agent.pose_feed.fix import FieldPlacement
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import RfedgeError
 from rfcore.views import PosedPicture
