@@ -26,8 +26,6 @@ from lab.size_tables import EvalSizing
 from lab.world import EvalWorld
 from rfedge.program import CONFIG, run_program
 
-__all__ = ["main", "parse"]
-
 Verb = (
     Annotated[EvalAdapt, subcommand("adapt")]
     | Annotated[Bench, subcommand("bench")]

@@ -24,8 +24,6 @@ from rfedge.arguments import JSON
 from rfedge.evaluate.savings import slice_nals
 from rfedge.results import make_result, provenance, write_result
 
-__all__ = ["EvalIntraSize", "IntraCoding", "SceneSizes", "intra_bytes", "sizes_of", "write_sizes"]
-
 
 @dataclass(frozen=True)
 class IntraCoding:

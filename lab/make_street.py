@@ -32,9 +32,6 @@ from rfedge.samples import sample_path
 with needs("scene"):
     import cv2
 
-__all__ = ["MakeSample", "main", "pack_sample"]
-
-
 COMMAND = "make sample"
 
 

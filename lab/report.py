@@ -12,8 +12,6 @@ from pathlib import Path
 from rfedge.report.tables import Parts, Table
 from rfedge.results import Result
 
-__all__ = ["Draw", "Report", "bars", "described_host", "folded", "page_of"]
-
 Draw = Callable[[Result, Path, str], list[Path]]
 """Draws a result into a folder, its first figure with the name of the result file; returns the
 files."""

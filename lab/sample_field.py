@@ -26,8 +26,6 @@ from rfedge.samples import sample_path
 from rfedge.training.finish import size_goal
 from rfedge.training.run import training_config
 
-__all__ = ["MAX_BYTES", "MakeSampleField", "main", "write_sample_field"]
-
 MAX_BYTES = 8_000_000
 """More would weigh down every checkout."""
 

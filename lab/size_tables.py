@@ -20,8 +20,6 @@ from rfedge.samples import sample_path
 from rfedge.sizing.measure import MIN_FRAMES, SETTLED_FRAMES, measured_cells, read_sized_drive
 from rfedge.sizing.tables import SizingCell
 
-__all__ = ["EvalSizing", "Footage"]
-
 SAMPLE = f"vehicles@10={sample_path('street/transforms_drive_vehicles.json')}"
 STEPS = (1, 2, 3, 5)
 """Every n-th frame of a drive stands for a slower camera."""

@@ -30,16 +30,6 @@ from rfedge.report.tables import Table, named_columns
 from rfedge.results import Result, make_result, provenance, write_result
 from rfedge.samples import sample_path
 
-__all__ = [
-    "MAX_SLOPE_MB",
-    "REPORT",
-    "SoakRow",
-    "SoakSettings",
-    "slope_per_minute",
-    "soak",
-    "what_grew",
-]
-
 Amount = TypeVar("Amount", int, float)
 
 MAX_SLOPE_MB = 1.0

@@ -12,8 +12,6 @@ from rfcore.errors import RfedgeError
 from rfcore.wire.twin import Subscription, TwinPicture
 from rfcore.wire.twin_client import TwinClient
 
-__all__ = ["TwinReader", "reading"]
-
 END_S = 20.0
 
 

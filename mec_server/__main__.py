@@ -12,8 +12,6 @@ from mec_server.server import serve
 from rfcore.errors import RfedgeError
 from rfcore.wire.settings import OPTIONS, configure_logs
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Parse the command line and serve until SIGTERM or SIGINT; exit 2 on a user's mistake."""

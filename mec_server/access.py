@@ -35,8 +35,6 @@ from rfcore.files import is_regular, open_at_once
 from rfcore.wire.checks import check_name, shown
 from rfcore.wire.identity import PeerIdentity, Role, parse_identity
 
-__all__ = ["EVERYTHING", "AccessList", "Grant", "read_access"]
-
 
 @dataclass(frozen=True)
 class Grant:

@@ -17,15 +17,6 @@ from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, shown
 from rfcore.wire.messages import CameraDescription, Credit, Frame, FrameAddress, Hello
 
-__all__ = [
-    "MAX_EPOCH_STEP",
-    "MAX_GAP",
-    "CameraQueue",
-    "SequenceGap",
-    "SessionCameras",
-    "WaitingFrame",
-]
-
 MAX_GAP = 64
 """Sequences that may be missing at once; credits keep an honest sender far below it."""
 

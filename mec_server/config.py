@@ -15,18 +15,6 @@ from rfcore.wire.checks import MAX_RATE_HZ, check_name, check_range
 from rfcore.wire.nats import NatsServers
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
 
-__all__ = [
-    "AdmissionLimits",
-    "DecoderKind",
-    "IdentityBudget",
-    "LearnSettings",
-    "NatsSettings",
-    "RecordSettings",
-    "ServerBudget",
-    "ServerConfig",
-    "SessionLimits",
-]
-
 
 class DecoderKind(StrEnum):
     """The process that decodes packets (``rfcore.confinement``). AUTO decodes in the server if only

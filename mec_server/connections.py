@@ -37,8 +37,6 @@ from urllib.parse import quote, unquote
 
 from mec_server.ledger.budgets import Limit
 
-__all__ = ["MOST_HEADER_BYTES", "ClosedConnections", "Connections", "keep_silent_out", "source_of"]
-
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 SILENT_S = 5
 """Seconds for which a connection may be silent before gRPC is given it; TCP rounds up."""

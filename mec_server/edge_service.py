@@ -21,8 +21,6 @@ from mec_server.stream import Context, ServerContext, Stream
 from rfcore.errors import LimitExceeded
 from rfcore.wire.conventions import STREAM_METHOD
 
-__all__ = ["EdgeService"]
-
 
 class EdgeService:
     """Accepts streams, and ends them when the server drains."""

@@ -19,17 +19,6 @@ from itertools import count as count_up
 from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
-__all__ = [
-    "BACKGROUND_NICE",
-    "FairQueue",
-    "LazyTimer",
-    "Workers",
-    "give_way",
-    "on_every_thread",
-    "repeat_forever",
-    "work_when_idle",
-]
-
 R = TypeVar("R")
 T = TypeVar("T")
 Work = Callable[[], Any]

@@ -27,8 +27,6 @@ from mec_server.proxies import Proxies
 from rfcore.errors import AccessDenied, RfedgeError
 from rfcore.wire.identity import PeerIdentity, peer_identity
 
-__all__ = ["Guard"]
-
 log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[Any, Any]
 Handler = Any  # grpc's RpcMethodHandler: of any of four kinds

@@ -49,8 +49,6 @@ from rfcore.update.run import LearnAs
 from rfcore.views import PosedPicture
 from rfcore.wire.settings import LogForm, configure_logs
 
-__all__ = ["Learner", "UnrecordedTrials", "learning_job", "main"]
-
 log = structlog.get_logger()
 
 EVERY_S = 0.5

@@ -31,8 +31,6 @@ from rfcore.wire.instruments import DurationSeries, Family, Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
 from rfcore.wire.tiles import Tile
 
-__all__ = ["BackgroundTask", "OpeningResult", "ReadCounter", "ServerMetrics", "VehicleMetrics"]
-
 log = structlog.get_logger()
 
 

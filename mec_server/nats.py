@@ -34,8 +34,6 @@ with needs("nats"):
     from nats.js.kv import KeyValue
     from nats.js.object_store import ObjectStore
 
-__all__ = ["FieldExchange", "NatsLink", "fetch_object", "places_bucket", "together"]
-
 log = structlog.get_logger()
 
 CONNECT_S: Final = 2

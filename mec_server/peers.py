@@ -38,16 +38,6 @@ from rfcore.errors import (
 from rfcore.wire.conventions import RETRY_AFTER
 from rfcore.wire.identity import peer_identity
 
-__all__ = [
-    "ChargeRpcs",
-    "Slots",
-    "abort",
-    "handler_within",
-    "peer_account",
-    "peer_log",
-    "status_of",
-]
-
 log = structlog.get_logger()
 
 FAILED = "the server failed in this call, and has logged why"

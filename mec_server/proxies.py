@@ -26,8 +26,6 @@ from rfcore.errors import AccessDenied
 from rfcore.wire.checks import shown
 from rfcore.wire.identity import PeerIdentity, Role, identity_uri, peer_identity
 
-__all__ = ["FORWARDED", "Proxies", "forwarded_auth_context"]
-
 FORWARDED = "x-forwarded-client-cert"
 CLIENTS = frozenset({Role.VEHICLE, Role.CONSUMER, Role.OPERATOR})
 PAIR = re.compile(r'([A-Za-z]+)=("(?:[^"\\]|\\.)*"|[^",;]*)')

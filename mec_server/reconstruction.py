@@ -29,18 +29,6 @@ from rfcore.native.yuv import field_view_from_view
 from rfcore.views import FieldView, View
 from rfcore.wire.messages import CameraDescription, StageTimes
 
-__all__ = [
-    "CameraDecoder",
-    "Decoder",
-    "DecodingParts",
-    "FieldSource",
-    "OpenCameras",
-    "Reconstruction",
-    "StreamDecoders",
-    "Tools",
-    "open_cameras",
-]
-
 ClockNs = Callable[[], int]
 
 

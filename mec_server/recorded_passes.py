@@ -30,16 +30,6 @@ from rfcore.update.passes import Pass, SeenFrame, spread
 from rfcore.views import PosedPicture
 from rfcore.wire.tile_manifest import TileVersions
 
-__all__ = [
-    "RecordedPass",
-    "Recordings",
-    "by_light",
-    "hour_of",
-    "light_of",
-    "pass_of",
-    "readable",
-]
-
 log = structlog.get_logger()
 
 FITS_LEVELS = 6.0

@@ -37,16 +37,6 @@ from rfcore.image import I420, png_bytes
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.wire.messages import Frame, Hello
 
-__all__ = [
-    "FieldTiles",
-    "KeepLimits",
-    "Recorder",
-    "RecordingQuota",
-    "SessionRecording",
-    "open_recorder",
-    "picture_name",
-]
-
 MAX_WAITING = 32
 """Pictures that may wait for the disk; beyond it decoding waits, and with it the vehicle."""
 TIDY_EVERY_S = 60.0

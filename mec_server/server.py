@@ -70,8 +70,6 @@ from rfcore.wire.instruments import Family, MetricsEndpoint
 if TYPE_CHECKING:
     from mec_server.twin.nats import NatsServices
 
-__all__ = ["EdgeServer", "metric_families", "serve"]
-
 log = structlog.get_logger()
 
 PUBLICATIONS_EVERY_S = 1.0

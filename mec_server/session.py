@@ -49,16 +49,6 @@ from rfcore.wire.messages import (
 )
 from rfcore.wire.notices import StreetNotice
 
-__all__ = [
-    "DecodeJob",
-    "OpenJob",
-    "RenderTooLate",
-    "ServerSession",
-    "SessionState",
-    "StreamEnd",
-]
-
-
 MAX_UNUSABLE = 64
 """Messages in a row that are refused before any work is spent on them; then the stream ends."""
 

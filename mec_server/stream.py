@@ -44,8 +44,6 @@ from rfcore.wire.identity import peer_identity
 from rfcore.wire.messages import Frame, Hello
 from rfcore.wire.notices import StreetNotice
 
-__all__ = ["Context", "ServerContext", "Stream"]
-
 log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[bytes, bytes]
 

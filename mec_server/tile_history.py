@@ -17,8 +17,6 @@ from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.wire.tiles import LearntLight
 
-__all__ = ["LEARNING", "Learnt", "TileHistory", "read_histories", "write_histories"]
-
 LEARNING = ".learning"
 HISTORIES = "tiles.json"
 

@@ -47,15 +47,6 @@ from rfcore.wire.publish import Ground, publish, roll_back
 from rfcore.wire.tile_manifest import TileVersions, VersionLabel, read_publication
 from rfcore.wire.tiles import Tile
 
-__all__ = [
-    "CHECK_EVERY",
-    "CHECK_FRAMES",
-    "BitsIncrease",
-    "LearningJob",
-    "LearningRounds",
-    "percent_worse",
-]
-
 log = structlog.get_logger()
 
 MOST_PASSES = 6

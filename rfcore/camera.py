@@ -20,8 +20,6 @@ from dataclasses import dataclass, replace
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["MAX_SIDE_PX", "Camera", "Intrinsics", "Pose", "TileOrigin", "camera_on_rig"]
-
 MAX_SIDE_PX = 8192
 """Longest picture side accepted anywhere."""
 

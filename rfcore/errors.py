@@ -24,24 +24,6 @@ it as one line and exit with status 2; services map it to one gRPC status (``rfc
 from enum import StrEnum
 from typing import Any
 
-__all__ = [
-    "AccessDenied",
-    "BackendUnavailable",
-    "BitstreamError",
-    "CodecError",
-    "DatasetError",
-    "FieldFormatError",
-    "InvalidData",
-    "InvalidInput",
-    "LimitExceeded",
-    "PacketRejected",
-    "ProtocolError",
-    "RejectReason",
-    "RfedgeError",
-    "TrainingDiverged",
-    "UnknownField",
-]
-
 
 class RfedgeError(Exception):
     """Base of all errors rfedge raises on purpose; it can be pickled with all its attributes."""

@@ -16,8 +16,6 @@ from importlib.util import find_spec
 
 from rfcore.errors import BackendUnavailable
 
-__all__ = ["needs", "require"]
-
 
 @contextmanager
 def needs(extra: str) -> Iterator[None]:

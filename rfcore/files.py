@@ -21,16 +21,6 @@ from typing import BinaryIO
 
 from rfcore.errors import InvalidInput
 
-__all__ = [
-    "DECODED_BYTES",
-    "is_regular",
-    "open_at_once",
-    "whole_file",
-    "whole_folder",
-    "write_whole",
-]
-
-
 DECODED_BYTES = 2 << 30
 """Default limit of the memory for a file's decoded content: 9 million splats of SH degree 3."""
 

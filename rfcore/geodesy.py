@@ -18,8 +18,6 @@ from rfcore.camera import Pose, TileOrigin, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
 
-__all__ = ["Anchor", "anchor_of_values", "anchor_values"]
-
 Rotation = tuple[float, float, float, float]
 UPRIGHT: Rotation = (1.0, 0.0, 0.0, 0.0)
 

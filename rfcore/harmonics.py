@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["SH_DC", "higher_harmonics"]
-
 SH_DC = 0.28209479177387814
 """The constant harmonic of degree 0, sqrt(1 / (4 pi)): colour = 0.5 + SH_DC * coefficient."""
 

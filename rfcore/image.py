@@ -23,18 +23,6 @@ from numpy.typing import NDArray
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.files import write_whole
 
-__all__ = [
-    "I420",
-    "Rgb",
-    "jpeg_bytes",
-    "png_bytes",
-    "read_rgb",
-    "rgb_from_bytes",
-    "rgb_from_colour",
-    "rgb_from_video_frame",
-    "write_png",
-]
-
 Rgb = NDArray[np.uint8]
 Plane = NDArray[np.uint8]
 

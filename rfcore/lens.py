@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 from rfcore.camera import Intrinsics, Pose
 from rfcore.errors import InvalidInput
 
-__all__ = ["BrownLens", "FisheyeLens", "Lens", "LensCamera"]
-
 F64 = NDArray[np.float64]
 
 NEWTON_STEPS = 50

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["mean_squared_error", "psnr", "ssim"]
-
 Picture = NDArray[Any]
 UINT8_PEAK = 255.0
 RADIUS_PX = 5

@@ -17,8 +17,6 @@ import math
 from rfcore.camera import Pose, Vec3
 from rfcore.errors import InvalidInput
 
-__all__ = ["interpolated", "quaternion_from_vector", "rotation_vector"]
-
 TINY_RAD = 1e-150
 """Below this angle its sine equals it, and their quotient might underflow."""
 

@@ -14,8 +14,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["REQUIRED", "Fail", "Range", "Table", "shortened"]
-
 Fail = Callable[[str, str], Exception]
 """Makes the error to raise of a dotted path and of what is wrong there."""
 

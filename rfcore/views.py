@@ -35,18 +35,6 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
-__all__ = [
-    "BEND_LIMIT",
-    "FieldView",
-    "HeldFieldView",
-    "HeldPlane",
-    "PointCloud",
-    "PosedPicture",
-    "View",
-    "confidence",
-]
-
-
 BEND_LIMIT = np.float32(0.1)
 """A break of a tenth of the nearer side's inverse depth leaves no confidence.
 

@@ -43,21 +43,6 @@ from rfedge.evaluate.runner import Run, program_version
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
-__all__ = [
-    "AT_DB",
-    "REPORT",
-    "AdaptCase",
-    "AdaptRow",
-    "drives_to_break_even",
-    "kbit_at",
-    "messages_differ",
-    "most_kbit",
-    "recovered_percent",
-    "run_adapt",
-    "second_vehicle_percent",
-    "tool_ms",
-]
-
 AT_DB = 33.0
 FINER_DB = 36.0
 LEAST_LOSS = 0.1

@@ -34,8 +34,6 @@ from rfcore.native.yuv import field_view_from_view, i420_from_rgb
 from rfcore.raster.native import Rasterizer
 from rfcore.views import FieldView
 
-__all__ = ["CodecRow", "codec_rows"]
-
 T = TypeVar("T")
 
 SIZES_PX = ((640, 360), (1280, 720))

@@ -28,8 +28,6 @@ from rfcore.views import PosedPicture
 from rfedge.samples import sample_path
 from rfedge.timing import median_ms
 
-__all__ = ["NgpRow", "check_against_reference", "ngp_rows"]
-
 STREET = sample_path("street")
 ITERATIONS = 600
 BUDGETS = (None, 16, 12, 8)

@@ -32,15 +32,6 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfedge.timing import median_ms, medians_ms
 
-__all__ = [
-    "OPENCL_SIZES_PX",
-    "OpenClRow",
-    "RasterRow",
-    "check_against_reference",
-    "opencl_rows",
-    "raster_rows",
-]
-
 OPENCL_SIZES_PX = ((640, 360), (1920, 1080))
 CPU_THREADS = os.cpu_count() or 1
 """Threads of the CPU's renderer when it is compared with a device: all there are."""

@@ -17,8 +17,6 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
 
-__all__ = ["STREET_GAUSSIANS", "STREET_SEED", "street_camera", "street_gaussians"]
-
 STREET_GAUSSIANS = 200_000
 STREET_SEED = 1
 FIELD_OF_VIEW_DEG = 70.0

@@ -13,8 +13,6 @@ from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfedge.timing import median_ms
 
-__all__ = ["TrainRow", "check_gradients", "train_rows"]
-
 SIZES_PX = ((640, 360),)
 THREADS = (1, 2)
 RATES = LearningRates(

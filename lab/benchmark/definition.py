@@ -44,21 +44,6 @@ from rfedge.report.tables import Table as ScoreTable
 from rfedge.results import Result, rows_of
 from rfedge.samples import sample_path
 
-__all__ = [
-    "REPORT",
-    "V1",
-    "Benchmark",
-    "BenchmarkDrive",
-    "BenchmarkRow",
-    "Scoring",
-    "described",
-    "print_scores",
-    "read_benchmark",
-    "record_anchors",
-    "score_parts",
-    "score_rows",
-]
-
 V1 = Path(__file__).parent / "v1.toml"
 POSITIVE, COUNT = Range(low=1e-9), Range(low=1)
 SSIM_DIGITS = 6

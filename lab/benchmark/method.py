@@ -41,8 +41,6 @@ from rfcore.image import I420, write_png
 from rfedge.evaluate.clips import Drive
 from rfedge.results import host
 
-__all__ = ["CODER_NEEDS", "DECODER_NEEDS", "Command", "check_decoder", "run_method"]
-
 CODER_NEEDS, DECODER_NEEDS = ("frames", "point", "out"), ("packets", "out")
 MAY_NAME = ("hz", "point", "prior")
 SHOWN_BYTES = 600

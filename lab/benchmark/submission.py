@@ -33,20 +33,6 @@ from rfedge.evaluate.clips import CodedClip, Drive, luma_mse
 from rfedge.evaluate.ssim import luma_ssim
 from rfedge.results import as_json
 
-__all__ = [
-    "PACKET",
-    "PNG",
-    "PRIOR",
-    "RAW",
-    "SUBMISSION",
-    "CodedPoint",
-    "Submission",
-    "Tell",
-    "check_submission",
-    "read_picture",
-    "read_submission",
-]
-
 SUBMISSION = "submission.json"
 PRIOR = "prior"
 PACKET, RAW, PNG = ".packet", ".yuv", ".png"

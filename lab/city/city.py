@@ -61,18 +61,6 @@ from rfcore.wire.checks import MAX_CAMERAS
 from rfedge.arguments import parse_size
 from rfedge.sizing.estimate import Assumptions, Demand
 
-__all__ = [
-    "Admission",
-    "Cells",
-    "City",
-    "Density",
-    "Servers",
-    "Tile",
-    "VehicleKind",
-    "grid_city",
-    "read_city",
-]
-
 Floats = NDArray[np.float64]
 
 MAX_CELLS = 20_000

@@ -40,19 +40,6 @@ from rfcore.wire.messages import Ack, Credit, FrameAddress, StageTimes
 from rfedge.sizing.estimate import estimate, nearest_cell
 from rfedge.sizing.tables import SizingTables
 
-__all__ = [
-    "AGE_SAMPLES",
-    "FIRST_FRAME_RATIO",
-    "Costs",
-    "Flow",
-    "SharedLoad",
-    "age_samples_s",
-    "answer_bytes",
-    "city_flow",
-    "costs_of",
-    "queue_wait",
-]
-
 FIRST_FRAME_RATIO = 1.2
 """Bytes of a frame that is predicted from the render alone, as the first at another server is, over
 those of one that has the frame before: 9040 to 7606 bytes a message, 24 frames of the sample drive

@@ -17,8 +17,6 @@ from lab.city.traffic import TrafficBlock
 from rfcore.errors import InvalidInput
 from rfedge.report.tables import shown
 
-__all__ = ["CellRow", "CityPlan", "LimitRow", "Minute", "MinuteRow", "ServerRow", "plan_city"]
-
 PERCENTILES = (0.5, 0.95, 0.99)
 AGE_LIMIT = "age of pictures, p99"
 

@@ -28,15 +28,6 @@ from rfedge.loadtest.prerecorded import PrerecordedDrive
 from rfedge.loadtest.run import Run, TestBed, recorded, run_load
 from rfedge.sizing.estimate import Assumptions, Demand
 
-__all__ = [
-    "LoadFigures",
-    "PlannedLoad",
-    "PlannedRow",
-    "compare_with_plan",
-    "fitted_costs",
-    "planned_figures",
-]
-
 FIT_VEHICLES = (6, 60)
 """Vehicles of the two loads that the costs are measured with; plans are trusted in between."""
 

@@ -10,8 +10,6 @@ from lab.city.plan import CityPlan, LimitRow, MinuteRow, ServerRow
 from rfedge.report.tables import Table, columns
 from rfedge.results import Result, rows_of
 
-__all__ = ["city_content", "city_parts"]
-
 SHOWN_SERVERS = 20
 
 

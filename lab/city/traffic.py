@@ -35,14 +35,6 @@ from numpy.typing import NDArray
 from lab.city.city import Cells, City, Density, Floats
 from rfcore.errors import InvalidData, InvalidInput
 
-__all__ = [
-    "INTERVAL_S",
-    "CellMap",
-    "TrafficBlock",
-    "stated_traffic",
-    "trace_traffic",
-]
-
 INTERVAL_S = 60.0
 REACH = 1.1
 """A cell takes vehicles up to so many radii from its centre: as far as a hexagon's corner is, of

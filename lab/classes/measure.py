@@ -48,16 +48,6 @@ from streetgen.classes import Label, class_picture_of, read_classes
 with needs("eval"):
     from scipy.interpolate import PchipInterpolator
 
-__all__ = [
-    "GROUPS",
-    "REPORT",
-    "ClassCoder",
-    "ClassQuality",
-    "quality_at",
-    "read_groups",
-    "run_classes",
-]
-
 GROUPS = ("rest", "vehicle", "person", "sign", "marking")
 ALL = "all"
 """The class of the whole picture."""

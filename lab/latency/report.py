@@ -16,15 +16,6 @@ from rfcore.errors import InvalidInput
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
-__all__ = [
-    "REPORT",
-    "NeededRow",
-    "PlayedRow",
-    "ShownRow",
-    "latency_parts",
-    "write_latency_figures",
-]
-
 
 @dataclass(frozen=True)
 class NeededRow:

@@ -43,21 +43,6 @@ from rfedge.evaluate.rivals import x264_lowdelay
 from rfedge.evaluate.runner import Run, coded_clip, program_version
 from rfedge.jobs import CellStore
 
-__all__ = [
-    "BUDGETS_MS",
-    "FRAMES_FOR_REQUIREMENT",
-    "REQUIREMENT",
-    "FrameWork",
-    "Played",
-    "at_quality",
-    "needed_rate_bps",
-    "play",
-    "repeated",
-    "run_latency",
-    "show",
-]
-
-
 WINDOW = 2
 """Frames of one camera under way (``mec_server.config.SessionLimits``)."""
 CAPTURED = 1e-9

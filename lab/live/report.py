@@ -9,8 +9,6 @@ from lab.report import Report, bars
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
-__all__ = ["REPORT", "AgeRow", "IngestRow", "SourceRow", "live_parts"]
-
 
 @dataclass(frozen=True)
 class AgeRow:

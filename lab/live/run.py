@@ -33,8 +33,6 @@ from rfedge.processes import command_of, service
 from rfedge.report.tables import print_tables
 from rfedge.results import CHECKOUT, make_result, provenance, write_result
 
-__all__ = ["LiveCamera", "measure_source", "run_live"]
-
 SENDER = CHECKOUT / "deploy/live/gst_sender.py"
 """Runs under the system's Python, which has GStreamer's bindings; it is no part of the package."""
 SYSTEM_PYTHON = "/usr/bin/python3"

@@ -36,15 +36,6 @@ with needs("loadtest"):
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service as Driver
 
-__all__ = [
-    "PictureAges",
-    "TwinBed",
-    "agent",
-    "ingest_latencies_ms",
-    "measure_age",
-    "measure_ingest",
-]
-
 STOP_S = 20.0
 
 

@@ -29,8 +29,6 @@ from rfedge.evaluate.clips import luma_mse, psnr_of_mse
 from rfedge.located import LocatedDrive, Observation, TimedFix, times_of
 from rfedge.offline import FrameInput, encode_frames
 
-__all__ = ["bits_row", "sensors_of", "tracking_times"]
-
 OFFICIAL = "official"
 """The pose error of a drive's ``feed``."""
 OFFICIAL_SD_M, OFFICIAL_SD_DEG = 0.75, 1.0

@@ -30,8 +30,6 @@ from rfedge.localisation.searches import (
     search,
 )
 
-__all__ = ["false_starts", "row_of"]
-
 U8 = NDArray[np.uint8]
 
 HALF_TURN = (0.0, math.pi, 0.0)

@@ -31,8 +31,6 @@ from rfcore.views import PosedPicture
 from rfedge.arguments import open_field
 from rfedge.localisation.searches import StartError, parse_start_error
 
-__all__ = ["GivenDrive", "aligned_poses", "read_pose_lines"]
-
 F64 = NDArray[np.float64]
 FORM = "NAME=DRIVE,FIELD[,KEY=VALUE...]"
 NUMBERS = ("units", "hz", "frames", "noise")

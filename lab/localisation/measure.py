@@ -31,8 +31,6 @@ from rfedge.results import Result, as_json, rows_of
 with needs("localise"):
     import cv2
 
-__all__ = ["REPORT", "WantedRow", "localise_parts", "rows_asked_for", "run_localise"]
-
 
 @dataclass(frozen=True)
 class WantedRow:

@@ -31,8 +31,6 @@ from rfcore.errors import InvalidInput
 from rfcore.motion import interpolated, quaternion_from_vector
 from rfedge.located import Observation
 
-__all__ = ["ERROR_MODELS", "PoseErrorModel", "observed", "parse_error_model"]
-
 F64 = NDArray[np.float64]
 
 ASIDE = 0.1

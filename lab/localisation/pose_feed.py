@@ -33,8 +33,6 @@ from rfcore.views import PosedPicture
 from rfedge.arguments import DATASET, FIELD, open_field
 from rfedge.located import Observation
 
-__all__ = ["FeedForm", "FeedPlan", "MakeFeed", "feed_lines", "sentence", "times_of"]
-
 FeedForm = Literal["nmea", "geodetic", "xyz"]
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 KNOTS = 3600 / 1852

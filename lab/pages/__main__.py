@@ -30,8 +30,6 @@ from rfcore.files import write_whole
 from rfedge.results import Result, read_result
 from rfedge.sizing.tables import SHIPPED
 
-__all__ = ["KINDS", "pages", "recorded", "with_headline", "write_figures"]
-
 CHECKOUT = RESULTS.parents[1]
 README_BEGINS, README_ENDS = "<!-- headline: generated -->", "<!-- headline: end -->"
 KINDS: Mapping[str, Report] = {

@@ -25,8 +25,6 @@ from rfedge.evaluate.ladder.rows import (
 from rfedge.report.tables import Column, Table, columns
 from rfedge.results import Result, read_result, rows_of
 
-__all__ = ["RECORDED", "ladder_parts", "shipped_ladder", "write_ladder_figure"]
-
 RECORDED = Path(__file__).parents[1] / "results/ladder.json"
 MADE = ("kind", "command", "revision", "host", "threads", "size_px", "fields")
 SHIPPED_RUNG = ("settings", "sender_ms", "receiver_ms", "rate_percent")

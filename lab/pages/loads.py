@@ -21,8 +21,6 @@ from rfedge.loadtest.run import LoadRow
 from rfedge.report.tables import Column, Table, text_table
 from rfedge.results import Result, make_result, provenance, read_result, rows_of, write_result
 
-__all__ = ["LOADS", "RATIO", "LimitRow", "RecordedLoad", "record"]
-
 KEY = (
     "mode",
     "kind",

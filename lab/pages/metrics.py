@@ -11,8 +11,6 @@ from mec_server import server
 from rfcore.wire.instruments import Family
 from rfedge.link.direction import LinkMetrics
 
-__all__ = ["families"]
-
 
 def families() -> Mapping[str, Sequence[Family]]:
     """Return what each command declares, with everything that a flag can add."""

@@ -25,9 +25,6 @@ from rfedge.evaluate.never_worse.measure import NeverWorseRow, never_worse_parts
 from rfedge.report.tables import Column, Table, named_columns, text_table
 from rfedge.results import Result, rows_of
 
-__all__ = ["REPORTS", "headline"]
-
-
 # --- compare
 
 README_DRIVES = ("sample-empty", "sample-vehicles", "kitti-loop")

@@ -14,8 +14,6 @@ from rfedge.results import Result, rows_of
 from rfedge.sizing.estimate import Demand
 from rfedge.sizing.tables import CODECS, SHIPPED, SizingCell, read_tables
 
-__all__ = ["REPORT", "city_table"]
-
 PAGE_DB = (32.0, 34.0, 36.0)
 BAR_DB = 34.0
 CITY_SERVERS = (10, 100, 1000)

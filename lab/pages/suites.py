@@ -17,8 +17,6 @@ from rfcore.errors import InvalidInput
 from rfedge.report.tables import Column, Table, columns, shown, text_table
 from rfedge.results import Result, read_result, rows_of
 
-__all__ = ["ATTACKS", "FAULTS", "STABILITY", "AttackRow", "FaultRow", "LinkCell", "StabilityRow"]
-
 RESULTS = Path(__file__).parents[1] / "results"
 HOLDS = Column("holds", lambda row: "yes" if row.held else "**no**")
 

@@ -23,9 +23,6 @@ from rfcore.image import Rgb
 from rfedge.report.charts import LINES, MARKERS, STYLE, write_figure
 from rfedge.results import Result
 
-__all__ = ["REPORT", "write_paper_figures", "write_views"]
-
-
 mpl.use("svg")
 
 VIEW_PX = 320

@@ -19,8 +19,6 @@ from rfcore.image import Rgb
 from rfcore.metrics import psnr
 from rfedge.evaluate.ssim import luma_ssim
 
-__all__ = ["BANDS", "RenderQuality", "colour_ssim", "flip", "render_quality", "residual_bands"]
-
 BANDS = ((0.0, 1 / 16), (1 / 16, 1 / 8), (1 / 8, 1 / 4), (1 / 4, 0.75))
 """Lowest and highest radial frequency in cycles a pixel; the corner of the plane is at 0.71."""
 LUMA = np.array([0.2126, 0.7152, 0.0722])

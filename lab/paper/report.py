@@ -19,18 +19,6 @@ from rfcore.errors import InvalidInput
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
-__all__ = [
-    "PaperMean",
-    "PaperRow",
-    "PaperTable",
-    "SettingColumns",
-    "means_of",
-    "paper_parts",
-    "paper_rows",
-    "paper_tables",
-    "savings_by_frame",
-]
-
 
 @dataclass(frozen=True)
 class PaperRow:

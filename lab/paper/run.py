@@ -58,19 +58,6 @@ from rfedge.jobs import CellStore, Job, Rows, Tell
 with needs("eval"):
     import cv2
 
-__all__ = [
-    "PUBLISHED_CRFS",
-    "PUBLISHED_PRESETS",
-    "PublishedFrame",
-    "Setting",
-    "named_path",
-    "published_rows",
-    "reduced",
-    "run_paper",
-    "views_of",
-]
-
-
 PUBLISHED_PRESETS = ("veryslow", "medium", "veryfast")
 PUBLISHED_CRFS = (18.0, 23.0, 28.0)
 Size = tuple[int, int]

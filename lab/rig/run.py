@@ -32,8 +32,6 @@ from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
 from rfedge.processes import Service, command_of, service
 from rfedge.results import Result, as_json, make_result, provenance
 
-__all__ = ["Spread", "instants_apart", "run_rig", "spreads_of"]
-
 
 @dataclass(frozen=True)
 class Spread:

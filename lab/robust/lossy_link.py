@@ -38,20 +38,6 @@ from rfcore.metrics import ssim
 from rfedge.evaluate.field_coder import RenderedClip, message_bytes
 from rfedge.offline import Arrival, decode_frames
 
-__all__ = [
-    "DATAGRAM_BYTES",
-    "Bursts",
-    "Crossing",
-    "Feedback",
-    "FrameCoder",
-    "Lossy",
-    "Outcome",
-    "Policy",
-    "delta_crossing",
-    "x264_crossing",
-]
-
-
 DATAGRAM_BYTES = 1200
 """A datagram of this size passes every network without fragments (RFC 9000, 14)."""
 

@@ -13,15 +13,6 @@ from rfcore.errors import InvalidInput
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
-__all__ = [
-    "REPORT",
-    "CrossingRow",
-    "DisturbanceRow",
-    "LossRow",
-    "robust_parts",
-    "write_robust_figure",
-]
-
 
 @dataclass(frozen=True)
 class CrossingRow:

@@ -49,16 +49,6 @@ from rfedge.evaluate.runner import Run, program_version
 from rfedge.jobs import CellStore, Job, Tell
 from rfedge.results import rows_of
 
-__all__ = [
-    "NOISES",
-    "PoseNoise",
-    "kbit_at",
-    "kbit_between",
-    "noisy_cameras",
-    "refined_cameras",
-    "run_robust",
-]
-
 
 @dataclass(frozen=True)
 class PoseNoise:

@@ -18,20 +18,6 @@ from rfcore.errors import InvalidInput
 from rfedge.report.tables import Table, columns, shown
 from rfedge.results import Provenance, Result, make_result, read_result, rows_of, write_result
 
-__all__ = [
-    "SCALE",
-    "WORLD",
-    "Case",
-    "Measured",
-    "RayTiles",
-    "ScaleRecord",
-    "ScaleRow",
-    "ScaleRun",
-    "WorldRow",
-    "scale_parts",
-    "world_parts",
-]
-
 KIND = "scale"
 SAME_HOST = ("cpu", "cores")
 """Facts of two hosts that must agree for their rows to stand in one table."""

@@ -25,17 +25,6 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
 from rfedge.processes import Service, command_of, service
 
-__all__ = [
-    "CLUSTER",
-    "PROXIED",
-    "Envoy",
-    "EnvoySetup",
-    "ServerGroup",
-    "check_config",
-    "envoy_binary",
-    "run_envoy",
-]
-
 START_S = 60.0
 POLL_S = 0.05
 LISTENER, ADMIN = "port_value: 50050", "port_value: 9901"

@@ -21,19 +21,6 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
 from rfedge.processes import command_of
 
-__all__ = [
-    "Fleet",
-    "Lines",
-    "ShownPicture",
-    "TwinWatch",
-    "failures",
-    "keyframes",
-    "p99",
-    "read_lines",
-    "resumed_s",
-    "shown_twice",
-]
-
 WAIT_S = 120.0
 POLL_S = 0.05
 

@@ -26,8 +26,6 @@ from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
 from rfedge.processes import command_of, service
 from rfedge.twin.nats_source import NatsPictures
 
-__all__ = ["NatsServer", "nats_binary", "nats_rows", "undisturbed"]
-
 BACK_S = 2.0
 WAY_TIMES, WAY_MORE_MS = 1.2, 10.0
 """A frame may take this many times as long from sending to Ack as before, and so much more."""

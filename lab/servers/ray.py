@@ -25,8 +25,6 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.convert import LIST_NAME, read_tiles
 from rfedge.processes import command_of
 
-__all__ = ["TileRun", "overhead_percent", "ray_case", "require_resumed", "train_tiles"]
-
 OVERHEAD_PERCENT = 5.0
 FEWEST_TILES = 3
 KILL_PERCENT = 50

@@ -40,8 +40,6 @@ from rfedge.report.tables import Table, columns
 from rfedge.results import provenance
 from rfedge.samples import sample_path
 
-__all__ = ["cases_of", "planned_load", "run_scale"]
-
 MOST_OVER_MEAN = 1.5
 RESUME_S = 1.0
 RESTART_S = 3.0

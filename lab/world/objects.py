@@ -57,17 +57,6 @@ from streetgen.effects.dusk import Dusk
 from streetgen.scene_file import Scene, load_scene
 from streetgen.shots import Selection
 
-__all__ = [
-    "AnnotatedDrive",
-    "FoundVehicles",
-    "dusk_rows",
-    "dusk_scenes",
-    "followed",
-    "noisy",
-    "object_rows",
-    "received",
-]
-
 LEAST_PX, REACH_M, MATCH_M = 400, 30.0, 2.0
 """Least size and greatest distance of a vehicle that must be found; distance from its outline
 beyond which an object is a false one."""

@@ -46,8 +46,6 @@ from rfedge.results import (
     write_result,
 )
 
-__all__ = ["run_world"]
-
 MAX_AGE_S = 2.0
 LIVE_AGE_S = 0.1
 """Age of the picture that a view is composed of."""

@@ -31,8 +31,6 @@ from streetgen.scene_file import load_scene
 with needs("scene"):
     import cv2
 
-__all__ = ["Drive", "Footprint", "SceneTruth", "VisibleVehicle", "aside"]
-
 F64 = NDArray[np.float64]
 SAMPLED = 4
 """Stride of the sampled pixels of vehicles."""

@@ -42,22 +42,6 @@ from rfcore.confinement.confine import Confinement, ProcessLimits, confine
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
-__all__ = [
-    "DECODER_NAME",
-    "DONE",
-    "FAILED",
-    "INPUT_BYTES",
-    "LIMITS",
-    "MAX_ANSWER_BYTES",
-    "MEMORY_BYTES",
-    "NUMBER",
-    "OUTPUT_AT",
-    "REQUEST_CPU_S",
-    "DecoderCommand",
-    "main",
-    "request_to_bytes",
-]
-
 LIMITS = ProcessLimits(address_space_bytes=1 << 30)
 """0.2 GiB is the interpreter; a 4096x2304 picture is 14 MB, and FFmpeg holds some twenty."""
 

@@ -40,8 +40,6 @@ from rfcore.confinement.start import ConfinedProgram, check_not_root
 from rfcore.errors import BackendUnavailable, CodecError, RfedgeError
 from rfcore.image import I420
 
-__all__ = ["ChildDecoder", "DecoderPool", "Decoders", "OpenDecoder", "decoder_program"]
-
 log = structlog.get_logger()
 
 CONFINEMENTS = {

@@ -38,15 +38,6 @@ from mec_server.decoding.child import (
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
 
-__all__ = [
-    "DecoderLost",
-    "DecoderProcess",
-    "ForkServer",
-    "ForkServerRetired",
-    "LossCause",
-    "WaitContext",
-]
-
 START_S = 20.0
 """Time limit of the fork server's start, 0.3 s on an idle machine and more on one that swaps or is
 overloaded, and of a fork, some ms."""

@@ -26,8 +26,6 @@ from rfcore.wire.settings import RenderSettings
 from rfcore.wire.tile_manifest import MANIFEST, Publication, read_publication
 from rfcore.wire.tiles import Tile
 
-__all__ = ["FieldIndex", "PublishedFields", "field_loader"]
-
 log = structlog.get_logger()
 Stamp = tuple[int, int, int] | None
 

@@ -20,8 +20,6 @@ from rfcore.wire.tiles import LearntLight, Tile, learnt_message, tile_message
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1 import field_pb2_grpc
 
-__all__ = ["FieldService"]
-
 R = TypeVar("R")
 AnyContext = grpc.aio.ServicerContext[Any, Any]
 

@@ -20,8 +20,6 @@ from rfcore.errors import InvalidInput
 from rfcore.field import Bounds, RadianceField, render_field_view
 from rfcore.field.interface import SPLATS
 
-__all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "read_chunk"]
-
 CHUNK_BYTES = 64 * 1024
 """Size of a chunk, the same as a connection's window: the memory that a peer which does not read
 costs."""

@@ -19,19 +19,6 @@ from pathlib import Path, PurePosixPath
 from mec_server.config import IdentityBudget, ServerBudget
 from rfcore.wire.messages import Hello
 
-__all__ = [
-    "HELD",
-    "SPENT",
-    "Budget",
-    "Limit",
-    "Resource",
-    "budgets_of",
-    "decoders_of",
-    "decoders_that_fit",
-    "memory_limit_bytes",
-    "usable_processors",
-]
-
 
 class Resource(StrEnum):
     """A resource that identities are charged for; label of ``rfedge_server_held`` and

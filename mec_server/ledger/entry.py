@@ -17,15 +17,6 @@ from mec_server.ledger.promises import ASSUMED_HZ, Promises
 from rfcore.errors import LimitExceeded
 from rfcore.wire.messages import Frame, Hello
 
-__all__ = [
-    "CAMERA_SILENT_S",
-    "ActiveCameras",
-    "CameraMeter",
-    "CameraSender",
-    "EntryControl",
-    "StreamAccount",
-]
-
 CAMERA_SILENT_S = 3.0
 """Silence after which another agent may take a camera over: by then the stream's own keepalive (2 s
 and 1 s) has noticed a dead connection. Cameras slower than 1 Hz get two of their periods more."""

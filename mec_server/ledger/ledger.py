@@ -14,15 +14,6 @@ from dataclasses import dataclass, field
 from mec_server.ledger.budgets import HELD, SPENT, Budget, Limit, Resource
 from rfcore.errors import LimitExceeded
 
-__all__ = [
-    "BARRED_S",
-    "HELD_RETRY_S",
-    "MAX_LOST_DECODERS",
-    "Hold",
-    "Ledger",
-    "TokenBucket",
-]
-
 MAX_LOST_DECODERS = 3
 BARRED_S = 60.0
 """An identity whose packets crash this many decoder processes within this time is refused for as

@@ -14,8 +14,6 @@ import structlog
 
 from mec_server.ledger.ledger import TokenBucket
 
-__all__ = ["LINES_PER_S", "LINE_BURST", "LogLimiter", "PeerLog"]
-
 LINES_PER_S, LINE_BURST = 5.0, 100.0
 """Enough for a vehicle that reconnects twice a second, and for all that one has to say at once."""
 

@@ -27,8 +27,6 @@ from mec_server.ledger.budgets import Limit
 from rfcore.errors import LimitExceeded
 from rfcore.wire.messages import Hello
 
-__all__ = ["ASSUMED_HZ", "Promises"]
-
 ASSUMED_HZ = 10.0
 """Rate of a vehicle that does not state how many pictures per second it would send."""
 

@@ -15,8 +15,6 @@ from rfcore.wire.instruments import Family, Instruments
 from rfcore.wire.notices import NOTICE_KINDS, ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
 
-__all__ = ["ConsumerEnd", "TwinMetrics"]
-
 AGE = Family(
     "rfedge_twin_age_seconds",
     "gauge",

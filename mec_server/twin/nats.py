@@ -50,8 +50,6 @@ with needs("nats"):
     from nats.js.errors import BadRequestError, KeyNotFoundError, KeyWrongLastSequenceError
     from nats.js.kv import KeyValue
 
-__all__ = ["NatsServices", "PlaceRecords", "TwinPublisher"]
-
 log = structlog.get_logger()
 
 FLUSH_S: Final = 3

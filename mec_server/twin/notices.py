@@ -44,15 +44,6 @@ from rfcore.wire.tiles import Tile
 from rfcore.wire.twin import PictureEncoding, Subscription
 from rfcore.wire.twin_render import ObjectsRequest
 
-__all__ = [
-    "NoticeTaker",
-    "OwnCamera",
-    "StreamNotices",
-    "StreetNotices",
-    "VehiclePosition",
-    "field_changes",
-]
-
 NOTICES_IDENTITY = "server: notices"
 """The identity that the analysis of pictures is charged to."""
 

@@ -56,8 +56,6 @@ from rfcore.wire.twin_render import (
     ViewRequest,
 )
 
-__all__ = ["Classify", "PictureObjects", "ViewService", "ViewedTile", "viewed_tile"]
-
 R = TypeVar("R")
 OpenField = Callable[[str], RadianceField]
 

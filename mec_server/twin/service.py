@@ -47,15 +47,6 @@ from rfcore.wire.twin_render import (
 from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 
-__all__ = [
-    "ConsumerAccess",
-    "PictureEncoder",
-    "RenderCalls",
-    "TwinService",
-    "picture_message",
-]
-
-
 Encodings = dict[PictureEncoding, asyncio.Future[bytes]]
 
 

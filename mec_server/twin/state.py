@@ -24,16 +24,6 @@ from rfcore.wire.newest_queue import NewestQueue
 from rfcore.wire.twin import Departure, Subscription
 from rfcore.wire.twin_render import DEFAULT_AGE_S, MAX_AGE_S
 
-__all__ = [
-    "PAST_S",
-    "Covers",
-    "KeptRenders",
-    "Mailbox",
-    "PastPictures",
-    "ReceivedPicture",
-    "Twin",
-]
-
 MAX_DEPARTED = 32
 """Last pictures kept of cameras that left."""
 RENDERS_BYTES = 96 * 2**20

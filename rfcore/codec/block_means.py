@@ -16,14 +16,6 @@ from numpy.typing import NDArray
 
 from rfcore.image import I420
 
-__all__ = [
-    "BLOCK_MEANS_BYTES",
-    "BLOCK_MEANS_TOLERANCE",
-    "block_mean_difference",
-    "block_mean_digest",
-    "median_block_mean_difference",
-]
-
 _BLOCKS_PER_SIDE = 8
 BLOCK_MEANS_BYTES = _BLOCKS_PER_SIDE * _BLOCKS_PER_SIDE
 BLOCK_MEANS_TOLERANCE = 1

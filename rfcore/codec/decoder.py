@@ -29,8 +29,6 @@ from rfcore.image import I420
 from rfcore.native.yuv import digest_pair
 from rfcore.views import FieldView
 
-__all__ = ["Decoded", "DeltaDecoder", "prediction_of"]
-
 _MEANS_REQUIRED = "between renderers that are not exact the sender must send them"
 
 

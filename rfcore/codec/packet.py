@@ -11,8 +11,6 @@ from rfcore.codec.photometric import MOST_LIGHT_BYTES, Photometric, check_photom
 from rfcore.codec.references import RENDER_ONLY, References, check_references, is_temporal
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 
-__all__ = ["BASE_DIGEST_BYTES", "DIGEST_BYTES", "CheckedPacket", "DeltaPacket", "check_packet"]
-
 DIGEST_BYTES = 16
 
 BASE_DIGEST_BYTES = 4

@@ -35,17 +35,6 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import apply_light, light_shape, solve_light
 
-__all__ = [
-    "COEFFICIENTS",
-    "MOST_LIGHT_BYTES",
-    "Photometric",
-    "adapt",
-    "check_photometric",
-    "lit_by",
-    "sent_light",
-    "solve",
-]
-
 COEFFICIENTS = 12
 LIMIT = 1 << 15
 _FRACTION_BITS = 12

@@ -16,8 +16,6 @@ from rfcore.image import I420
 from rfcore.native.warp import correct_i420, relight_i420, warp_i420
 from rfcore.views import FieldView
 
-__all__ = ["Prediction"]
-
 
 @dataclass(frozen=True, eq=False)
 class Prediction:

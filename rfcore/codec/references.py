@@ -16,16 +16,6 @@ from enum import IntEnum
 from rfcore.codec.h264.config import REFERENCE_FRAMES
 from rfcore.errors import InvalidInput
 
-__all__ = [
-    "INTRA",
-    "RENDER_ONLY",
-    "Reference",
-    "References",
-    "check_references",
-    "is_temporal",
-    "references_name",
-]
-
 
 class Reference(IntEnum):
     """A kind of reference picture. The numbers are those of the wire."""

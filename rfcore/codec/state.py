@@ -16,8 +16,6 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView
 
-__all__ = ["KEPT_FRAMES", "DecoderState", "EncoderState", "Past"]
-
 KEPT_FRAMES = 4
 """Decoded frames a receiver keeps: two in flight, the one before them, and one spare."""
 

@@ -15,15 +15,6 @@ from enum import StrEnum
 from rfcore.confinement.seccomp import WHILE_READING, Refusal, apply_filter, assembled
 from rfcore.errors import BackendUnavailable
 
-__all__ = [
-    "NOBODY",
-    "Confinement",
-    "ProcessLimits",
-    "confine",
-    "landlock_version",
-    "restrict_files_and_ports",
-]
-
 CREATE_RULESET, RESTRICT_SELF = 444, 446
 """System call numbers, the same on every machine."""
 ASK_VERSION = 1

@@ -23,17 +23,6 @@ from enum import Enum
 
 from rfcore.errors import BackendUnavailable
 
-__all__ = [
-    "NUMBERS",
-    "WHILE_READING",
-    "WHILE_STARTING",
-    "Allowed",
-    "Refusal",
-    "apply_filter",
-    "assembled",
-    "machine_column",
-]
-
 # name: number on x86_64 (asm/unistd_64.h), number on aarch64 (asm-generic/unistd.h).
 NUMBERS: dict[str, tuple[int | None, int | None]] = {
     "access": (21, None),

@@ -21,8 +21,6 @@ from rfcore.confinement.confine import Confinement
 from rfcore.confinement.seccomp import WHILE_STARTING, Refusal, assembled
 from rfcore.errors import BackendUnavailable
 
-__all__ = ["ConfinedProgram", "bubblewrap_command", "check_not_root"]
-
 SYSTEM = ("/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache")
 """What programs need of the system; read-only in a sandbox."""
 

@@ -30,17 +30,6 @@ from rfcore.geodesy import Anchor
 from rfcore.image import Rgb
 from rfcore.views import PointCloud, PosedPicture
 
-__all__ = [
-    "Dataset",
-    "Distortion",
-    "ReadOptions",
-    "area_averaged",
-    "assemble",
-    "check_reduction",
-    "chosen_origin",
-    "localised",
-]
-
 
 def check_reduction(name: str, from_px: tuple[int, int], to_px: tuple[int, int]) -> None:
     """Raise ``InvalidInput`` unless ``to_px`` (width, height) is 1 px or more and no larger."""

@@ -44,20 +44,6 @@ from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoi
 from rfcore.errors import DatasetError
 from rfcore.tables import shortened
 
-__all__ = [
-    "MODEL_IDS",
-    "ColmapImage",
-    "ColmapModel",
-    "camera_of",
-    "colmap_model_folder",
-    "image_of",
-    "parameter_count",
-    "read_binary_model",
-    "read_colmap_source",
-    "read_text_model",
-]
-
-
 MODEL_IDS = {
     0: "SIMPLE_PINHOLE",
     1: "PINHOLE",

@@ -24,24 +24,6 @@ from rfcore.geodesy import Anchor, anchor_of_values
 from rfcore.lens import BrownLens, FisheyeLens, Lens
 from rfcore.tables import Table
 
-__all__ = [
-    "LENS_KEYS",
-    "POSE_SHAPES",
-    "anchor_at",
-    "blamed_on",
-    "filled_lines",
-    "finite_numbers",
-    "lens_of",
-    "load_json",
-    "load_toml",
-    "pose_of_quaternion",
-    "pose_of_rows",
-    "read_file",
-    "table_at",
-    "text_lines",
-]
-
-
 POSE_SHAPES = ((3, 4), (4, 4))
 """Rows and columns of a pose's matrix; what a fourth row holds is checked with the pose."""
 FILE_NORM_TOLERANCE = 1e-3

@@ -44,8 +44,6 @@ from rfcore.dataset.trajectory import time_ns
 from rfcore.errors import DatasetError
 from rfcore.geodesy import Anchor
 
-__all__ = ["OXTS", "read_kitti_raw_source", "read_kitti_source"]
-
 OXTS = "oxts"
 """The folder by which a raw drive is recognised."""
 OXTS_NUMBERS = 30

@@ -15,8 +15,6 @@ from typing import Any
 from rfcore.errors import DatasetError
 from rfcore.files import write_whole
 
-__all__ = ["MANIFEST_NAME", "verify_manifest", "write_manifest"]
-
 MANIFEST_NAME = "manifest.json"
 
 

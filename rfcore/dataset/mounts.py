@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["RIG", "Mount", "mounts_named"]
-
 
 @dataclass(frozen=True)
 class Mount:

@@ -15,15 +15,6 @@ from rfcore.errors import DatasetError
 from rfcore.image import Rgb, read_rgb
 from rfcore.tables import shortened
 
-__all__ = [
-    "check_size",
-    "find_picture",
-    "inside",
-    "picture_file",
-    "picture_size_px",
-    "read_picture",
-]
-
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG", ".WEBP")
 MAX_PART_BYTES = 255
 """What Linux file systems take."""

@@ -32,15 +32,6 @@ from rfcore.dataset.transforms import read_transforms_source, transforms_file
 from rfcore.errors import DatasetError
 from rfcore.tables import Table
 
-__all__ = [
-    "is_video",
-    "read_dataset",
-    "read_inria_source",
-    "read_source",
-    "refuse_video",
-    "trained_ply",
-]
-
 
 def read_inria_source(file: Path) -> Source:
     """Read a ``cameras.json``. Raises ``DatasetError`` naming the file, the entry and the key."""

@@ -31,16 +31,6 @@ from rfcore.dataset.source import Source, SourceCamera, SourcePicture
 from rfcore.errors import DatasetError
 from rfcore.tables import Range, Table
 
-__all__ = [
-    "RECORDING_NAME",
-    "RecordedCamera",
-    "RecordedPart",
-    "RecordedPicture",
-    "read_recorded_part",
-    "read_recorded_source",
-    "recordings_under",
-]
-
 RECORDING_NAME = "recording.jsonl"
 VERSION = 1
 DEPTH = 3

@@ -66,14 +66,6 @@ from rfcore.errors import DatasetError
 from rfcore.image import Rgb, rgb_from_video_frame
 from rfcore.tables import Range, Table
 
-__all__ = [
-    "RecordedPoses",
-    "RecordingCamera",
-    "Video",
-    "read_recording_camera",
-    "read_recording_source",
-]
-
 
 class Video:
     """A video file; frames are decoded when read, cheaply when they are read in order.

@@ -39,17 +39,6 @@ from rfcore.files import write_whole
 from rfcore.tables import Range, Table
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "MAX_RIG_CAMERAS",
-    "RIG_FILE",
-    "Rig",
-    "RigCamera",
-    "RigInstant",
-    "read_rig",
-    "read_rig_drive",
-    "write_rig",
-]
-
 RIG_FILE = "rig.toml"
 
 MAX_RIG_CAMERAS = 32

@@ -20,8 +20,6 @@ from rfcore.geodesy import Anchor
 from rfcore.image import Rgb
 from rfcore.lens import Lens
 
-__all__ = ["Source", "SourceCamera", "SourcePicture", "SourcePoints", "read_points"]
-
 
 @dataclass(frozen=True)
 class SourceCamera:

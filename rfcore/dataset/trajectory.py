@@ -24,8 +24,6 @@ from rfcore.dataset.keys import finite_numbers, pose_of_quaternion, text_lines
 from rfcore.errors import DatasetError
 from rfcore.motion import interpolated
 
-__all__ = ["Trajectory", "read_trajectory", "time_ns"]
-
 NS_PER_S = 1_000_000_000
 MAX_TIME_NS = 2**63 - 1
 

@@ -40,8 +40,6 @@ from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoi
 from rfcore.errors import DatasetError
 from rfcore.tables import Range, Table
 
-__all__ = ["read_transforms_source", "transforms_file"]
-
 UNREAD_LENSES = ("ftheta_p0", "is_equirectangular", "is_latlong")
 """instant-ngp's lenses that are not read here."""
 

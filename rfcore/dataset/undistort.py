@@ -18,8 +18,6 @@ from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.lens import Lens
 
-__all__ = ["pinhole_of", "undistorted"]
-
 MIN_ZOOM = 0.5
 """A wide fisheye would be stretched without end; the middle keeps half its resolution."""
 MAX_ZOOM = 8.0

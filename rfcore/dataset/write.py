@@ -21,8 +21,6 @@ from rfcore.files import write_whole
 from rfcore.geodesy import Anchor, anchor_values
 from rfcore.lens import FisheyeLens
 
-__all__ = ["POINTS_NAME", "WrittenPicture", "transforms_of", "write_points", "write_transforms"]
-
 POINTS_NAME = "points.ply"
 COLUMNS = [(n, "<f8") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
 

@@ -36,19 +36,6 @@ from numpy.typing import NDArray
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.files import DECODED_BYTES, is_regular, open_at_once
 
-__all__ = [
-    "PREFIX_BYTES",
-    "RAISE_LIMIT",
-    "Archive",
-    "array_ends",
-    "check_array_bytes",
-    "check_length",
-    "decode_archive",
-    "encode_archive",
-    "header_end",
-    "read_file",
-]
-
 MAGIC = b"RFFIELD\0"
 VERSION = 1
 PREFIX = struct.Struct("<8sII32s16x")

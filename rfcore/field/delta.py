@@ -52,8 +52,6 @@ from rfcore.field.splats import SplatField
 from rfcore.files import DECODED_BYTES
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, joined
 
-__all__ = ["check_base", "delta_field", "delta_of"]
-
 ENCODING = "delta-1"
 ADDED = "added."
 SMALLEST_BAND = 2

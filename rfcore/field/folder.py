@@ -20,8 +20,6 @@ from rfcore.errors import FieldFormatError
 from rfcore.field.archive import HEAD_BYTES, MAGIC, check_length
 from rfcore.files import open_at_once
 
-__all__ = ["FIELD_ID", "MAX_ARCHIVE_BYTES", "SUFFIX", "FieldFolder", "FolderListing"]
-
 SUFFIX = ".rff"
 FIELD_ID = re.compile(r"[0-9a-f]{64}")
 """A field id: the hexadecimal digits of a SHA-256."""

@@ -33,15 +33,6 @@ from rfcore.harmonics import SH_DC, higher_harmonics
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.trainable import TrainableRasterizer
 
-__all__ = [
-    "contributions",
-    "frugal_colours",
-    "most_important_first",
-    "reordered",
-    "seen_directions",
-    "visible_area",
-]
-
 F64 = NDArray[np.float64]
 COMPONENT_WEIGHTS = (3.0, 0.5, 0.75)
 """Squared error of red, green and blue caused by one of luma, orange and green of YCoCg-R."""

@@ -20,16 +20,6 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 
-__all__ = [
-    "LIMIT",
-    "MAX_INFLATION",
-    "Columns",
-    "Integers",
-    "decode_columns",
-    "encode_columns",
-    "open_columns",
-]
-
 DICTIONARY_BYTES = 1 << 20
 FILTERS = (
     {

@@ -26,24 +26,6 @@ from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import sky_of
 from rfcore.views import FieldView, View
 
-__all__ = [
-    "DELTA",
-    "KINDS",
-    "LAYER",
-    "NGP",
-    "SPLATS",
-    "Bounds",
-    "FieldMetadata",
-    "RadianceField",
-    "Renderer",
-    "base_of",
-    "bounds_of_header",
-    "metadata_of_header",
-    "render_field_view",
-    "stored_metadata",
-]
-
-
 SPLATS = "splats"
 """3D Gaussian Splatting (Kerbl et al. 2023)."""
 NGP = "ngp"

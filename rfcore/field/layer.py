@@ -41,21 +41,6 @@ from rfcore.field.splats import SplatField
 from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
 
-__all__ = [
-    "MIDDLE_LUMA",
-    "OFFSET_STEP",
-    "OWN_STEP",
-    "SLOPE_STEP",
-    "VOXELS_M",
-    "ColourLayer",
-    "layer_archive",
-    "layered_colours",
-    "layered_field",
-    "luma_of",
-    "rgb_of",
-    "voxels_of",
-]
-
 ENCODING = "voxels-1"
 VOXELS_M = (0.25, 1.0, 4.0, 16.0)
 """Sides of the voxels, powers of two so that dividing by them is exact."""

@@ -34,9 +34,6 @@ from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.shape import HashGrid, Marching, NgpParameters, NgpShape, Space
 from rfcore.views import View
 
-__all__ = ["NgpField", "as_stored", "bounds_of", "ngp_archive", "ngp_of_archive"]
-
-
 ARRAYS = {"table", "matrices", "occupancy_at", "occupancy_words"}
 FLOAT16_MAX = np.float32(np.finfo(np.float16).max)
 

@@ -39,8 +39,6 @@ from rfcore.field.ply_table import (
 from rfcore.field.splat_archive import check_decoded_size
 from rfcore.raster.gaussians import Gaussians, empty_arrays
 
-__all__ = ["antialiased_of", "read_open_ply", "write_ply"]
-
 XYZ = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")

@@ -20,18 +20,6 @@ from numpy.typing import NDArray
 from rfcore.errors import FieldFormatError
 from rfcore.files import DECODED_BYTES, whole_file
 
-__all__ = [
-    "ASCII",
-    "Header",
-    "Table",
-    "read_header",
-    "read_rows",
-    "read_vertex_header",
-    "read_vertices",
-    "write_vertices",
-]
-
-
 MAX_HEADER_BYTES = 65_536
 ASCII = "ascii"
 ORDERS = {ASCII: "<", "binary_little_endian": "<", "binary_big_endian": ">"}

@@ -18,23 +18,6 @@ from dataclasses import dataclass, fields, replace
 from rfcore.errors import InvalidInput
 from rfcore.raster.gaussians import F32, Gaussians
 
-__all__ = [
-    "DETAILS",
-    "FULL",
-    "MAX_SAMPLES_PER_RAY",
-    "MAX_SH_DEGREE",
-    "SCALES",
-    "Beginning",
-    "LevelOfDetail",
-    "LevelsOfDetail",
-    "Quality",
-    "check_levels",
-    "kept_of",
-    "splats_at_detail",
-    "splats_in",
-]
-
-
 DETAILS = (1.0, 0.5, 0.25, 0.1)
 """The shares of a field's splats that can be drawn. A fixed list, so that every level has one
 definition and a field keeps at most four sets."""

@@ -20,8 +20,6 @@ from rfcore.camera import Camera, Intrinsics
 from rfcore.field.quality import Quality
 from rfcore.views import View
 
-__all__ = ["colour_at_scale", "view_at_scale"]
-
 F32 = NDArray[np.float32]
 
 

@@ -23,9 +23,6 @@ from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.harmonics import SH_DC, higher_harmonics
 from rfcore.raster.gaussians import F32, Gaussians
 
-__all__ = ["Similarity", "moved", "read_field_from_world", "spherical_harmonics"]
-
-
 F64 = NDArray[np.float64]
 DIRECTIONS = 64
 """Sample directions for the rotation of SH, which has at most 7 unknowns a row."""

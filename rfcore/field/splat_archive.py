@@ -54,22 +54,6 @@ from rfcore.field.splat_grid import (
 from rfcore.files import DECODED_BYTES
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, empty_arrays, sky_of
 
-__all__ = [
-    "ENCODING",
-    "GridSplats",
-    "check_decoded_size",
-    "compressed_archive",
-    "detail_ends",
-    "grid_splats",
-    "level_name",
-    "splat_archive",
-    "splats_of_archive",
-    "splats_of_beginning",
-    "splats_of_compressed",
-    "stream_shapes",
-]
-
-
 SPLATS_AT_ONCE = 1 << 16
 """Splats that are decoded together, few enough to take little memory; a multiple of BLOCK."""
 

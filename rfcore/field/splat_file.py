@@ -13,8 +13,6 @@ from rfcore.field.spz import read_open_spz
 from rfcore.files import DECODED_BYTES
 from rfcore.raster.gaussians import Gaussians
 
-__all__ = ["SPLAT_SUFFIXES", "check_suffix", "read_open_splat_file", "read_splat_file"]
-
 SPLAT_SUFFIXES = (".ply", ".spz")
 CONVERTED = (".splat", ".ksplat", ".sog")
 """Lossy formats that splat-transform converts."""

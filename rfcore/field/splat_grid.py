@@ -27,24 +27,6 @@ from rfcore.field.integers import LIMIT, Integers
 from rfcore.field.quality import LevelOfDetail
 from rfcore.raster.gaussians import F32, Gaussians
 
-__all__ = [
-    "BLOCK",
-    "FINEST",
-    "Grain",
-    "SplatNumbers",
-    "Steps",
-    "colour_numbers",
-    "colours_of",
-    "gaussians_of",
-    "level_numbers_of",
-    "level_of",
-    "means_of_steps",
-    "means_steps",
-    "numbers_of",
-    "placed",
-    "rotations_like",
-]
-
 BLOCK = 256
 ROTATION_STEPS = 127
 EXPONENTS = (-60, 60)

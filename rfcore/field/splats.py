@@ -35,8 +35,6 @@ from rfcore.raster.native import Rasterizer, check_renderer
 from rfcore.raster.renderers import is_opencl
 from rfcore.views import FieldView, View
 
-__all__ = ["SplatField"]
-
 
 class SplatField:
     """Gaussians with metadata, ready to render.

@@ -32,8 +32,6 @@ from rfcore.field.splat_archive import check_decoded_size
 from rfcore.files import write_whole
 from rfcore.raster.gaussians import Gaussians, with_sky_at
 
-__all__ = ["encode_spz", "read_open_spz", "write_spz"]
-
 MAGIC, VERSION = 0x5053474E, 3
 HEADER = struct.Struct("<IIIBBBB")
 """Magic, version, count, SH degree, fraction bits, flags; reserved, or in version 4 the number of

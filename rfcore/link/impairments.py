@@ -24,15 +24,6 @@ from rfcore.errors import InvalidInput
 from rfcore.link.shaper import LinkParts, Transmission
 from rfcore.tables import Range, Table, shortened
 
-__all__ = [
-    "Jitter",
-    "JitterDistribution",
-    "Outage",
-    "OutageTransmission",
-    "RandomOutage",
-    "parse_impairment",
-]
-
 Window = tuple[float, float]
 """(first second without the link, first second with it)"""
 

@@ -43,15 +43,6 @@ from rfcore.link.shaper import (
 )
 from rfcore.tables import Range, Table
 
-__all__ = [
-    "Arrival",
-    "DirectionPlan",
-    "Impairment",
-    "LinkPlan",
-    "delivery_times",
-    "read_link",
-]
-
 UNBOUNDED_BYTES = 2**62
 MAX_QUEUE_KIB = 1 << 20
 LIFE_S = Range(0.05, 1e6)

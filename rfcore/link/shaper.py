@@ -26,19 +26,6 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from rfcore.errors import InvalidInput
 
-__all__ = [
-    "MAX_DELAY_S",
-    "MAX_RATE_BPS",
-    "BusyMeter",
-    "ConstantRate",
-    "Delay",
-    "Delivery",
-    "Link",
-    "LinkParts",
-    "LinkProfile",
-    "Transmission",
-]
-
 MAX_RATE_BPS = 1e12
 """Above a terabit per second the transmission time drowns in the clock's resolution."""
 MAX_DELAY_S = 60.0

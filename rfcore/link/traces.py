@@ -27,16 +27,6 @@ from rfcore.errors import InvalidData
 from rfcore.link.shaper import MAX_DELAY_S, LinkParts
 from rfcore.tables import Range, Table
 
-__all__ = [
-    "OPPORTUNITY_BYTES",
-    "CapacityTrace",
-    "DelayTrace",
-    "TraceTransmission",
-    "parse_recording",
-    "read_cicv5g",
-    "read_mahimahi",
-]
-
 OPPORTUNITY_BYTES = 1500
 
 DELAY_COLUMNS = ("pub_time(ms)", "sub_time(ms)", "delay(ms)")

@@ -21,8 +21,6 @@ from rfcore.views import FieldView, View
 with needs("localise"):
     import cv2
 
-__all__ = ["agreement", "agreement_on_track", "near_on_the_spot"]
-
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 

@@ -35,8 +35,6 @@ from rfcore.views import BEND_LIMIT, FieldView
 with needs("localise"):
     import cv2
 
-__all__ = ["Aligned", "Expected", "Template", "align"]
-
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]

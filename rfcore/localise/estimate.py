@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from rfcore.camera import Pose
 from rfcore.views import FieldView
 
-__all__ = ["LocalisationState", "MeasurementError", "PoseEstimate", "TrackerEvent"]
-
 F64 = NDArray[np.float64]
 
 

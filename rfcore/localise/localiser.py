@@ -46,15 +46,6 @@ from rfcore.localise.structure import Pyramid
 from rfcore.localise.track import Track, begin_track
 from rfcore.views import FieldView, View
 
-__all__ = [
-    "Localised",
-    "Localiser",
-    "LocaliserSettings",
-    "Lost",
-    "Obstacle",
-    "median_depth",
-]
-
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 

@@ -23,18 +23,6 @@ from rfcore.views import View
 with needs("localise"):
     import cv2
 
-__all__ = [
-    "Features",
-    "Matches",
-    "PnpSolution",
-    "find_features",
-    "grey",
-    "lift_matches",
-    "match_features",
-    "solve_pose",
-    "use_one_thread",
-]
-
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]

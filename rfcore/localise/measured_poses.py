@@ -29,8 +29,6 @@ from rfcore.localise.prior import PoseMeasurement, PosePrior
 from rfcore.localise.track import Motion, Track
 from rfcore.motion import quaternion_from_vector, rotation_vector
 
-__all__ = ["UNKNOWN_SPEED_M_S", "MeasuredPoses", "SensorBias"]
-
 F64 = NDArray[np.float64]
 
 WALK_PER_ROOT_S = 0.25

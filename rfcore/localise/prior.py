@@ -22,8 +22,6 @@ from rfcore.camera import Pose, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.motion import quaternion_from_vector, rotation_vector
 
-__all__ = ["PoseMeasurement", "PosePrior", "hypotheses", "moved"]
-
 MAX_TIME_NS = 1 << 64
 REACH_OF_DEPTH = 0.25
 """Distance between rings, as a share of the scene's median depth."""

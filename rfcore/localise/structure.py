@@ -14,8 +14,6 @@ from rfcore.extras import needs
 with needs("localise"):
     import cv2
 
-__all__ = ["COARSEST_PX", "Pyramid", "halved", "structure"]
-
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 

@@ -23,16 +23,6 @@ from rfcore.localise.structure import Pyramid
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.views import FieldView
 
-__all__ = [
-    "HALF",
-    "Motion",
-    "RenderAt",
-    "Track",
-    "TrackingBudget",
-    "begin_track",
-    "follow_track",
-]
-
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 HALF = 1

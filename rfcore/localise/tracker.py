@@ -47,8 +47,6 @@ from rfcore.localise.track import (
 )
 from rfcore.views import FieldView
 
-__all__ = ["PoseTracker", "SearchJob", "TimedPose", "full_range"]
-
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]

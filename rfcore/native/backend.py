@@ -8,8 +8,6 @@ from rfcore.camera import Intrinsics, Mat3, Vec3
 from rfcore.errors import BackendUnavailable, InvalidInput
 from rfcore.native import _native
 
-__all__ = ["MAX_THREADS", "available_isas", "camera_numbers", "check_backend"]
-
 MAX_THREADS = 256
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 

@@ -61,22 +61,6 @@ from rfcore.native import _native
 from rfcore.native.backend import camera_numbers
 from rfcore.views import View
 
-__all__ = [
-    "COVERED",
-    "LEAST_MASK",
-    "MOST_DISTANCE_M",
-    "MOST_SOURCES",
-    "NOBODY",
-    "OWN_LIGHT",
-    "Canvas",
-    "Light",
-    "LiveSource",
-    "Patch",
-    "carry_to_view",
-    "draw_patch",
-    "live_difference",
-]
-
 COVERED = 0.5
 """Opacity above which the field has a surface."""
 NOISE_LEVELS, CHANGE_LEVELS = 16.0, 32.0

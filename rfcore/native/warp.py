@@ -72,20 +72,6 @@ from rfcore.native import _native
 from rfcore.native.backend import camera_numbers
 from rfcore.views import FieldView
 
-__all__ = [
-    "BLOCK_PX",
-    "CORRECTION_DOUBT",
-    "BlockCosts",
-    "apply_light",
-    "block_costs",
-    "correct_i420",
-    "light_shape",
-    "relight_i420",
-    "solve_light",
-    "warp_i420",
-    "warp_numbers",
-]
-
 BLOCK_PX = 8
 CORRECTION_DOUBT = 4
 """Levels. Squared errors of the luma prediction at 10 Hz empty, 10 Hz and 30 Hz with vehicles, and

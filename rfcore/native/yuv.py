@@ -38,14 +38,6 @@ from rfcore.image import I420, Rgb
 from rfcore.native import _native
 from rfcore.views import FieldView, View
 
-__all__ = [
-    "digest_pair",
-    "field_view_from_view",
-    "i420_from_colour",
-    "i420_from_rgb",
-    "rgb_from_i420",
-]
-
 
 def i420_from_rgb(rgb: Rgb) -> I420:
     """Convert uint8 [H, W, 3] to I420; raise ``InvalidInput`` for another shape or dtype."""

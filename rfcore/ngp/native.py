@@ -14,8 +14,6 @@ from rfcore.native.backend import camera_numbers, check_backend
 from rfcore.ngp.shape import F32, NgpParameters, NgpShape
 from rfcore.views import View
 
-__all__ = ["NgpRenderer", "native_shape", "ngp_camera"]
-
 
 def ngp_camera(camera: Camera) -> _native.NgpCamera:
     """Return the camera as the kernels take it: float32, rounded once from float64."""

@@ -24,17 +24,6 @@ with needs("reference"):
     import torch
     from torch import Tensor
 
-__all__ = [
-    "Rays",
-    "camera_rays",
-    "contract",
-    "encode",
-    "parameters",
-    "radiance",
-    "render",
-    "render_rays",
-]
-
 PRIMES = (1, 2654435761, 805459861)
 """NGP, eq. 4."""
 MIN_TRANSMITTANCE = 1e-4

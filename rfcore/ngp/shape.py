@@ -22,21 +22,6 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 from rfcore.native import _native
 
-__all__ = [
-    "FEATURES",
-    "MAX_LEVELS",
-    "HashGrid",
-    "Marching",
-    "NgpParameters",
-    "NgpShape",
-    "Space",
-    "grid_levels",
-    "initial_parameters",
-    "matrix_shapes",
-    "table_entries",
-]
-
-
 FEATURES = 2
 """F: features an entry; the kernels are written for the two of NGP, section 4."""
 MAX_LEVELS = 16

@@ -21,8 +21,6 @@ from rfcore.native.backend import check_backend
 from rfcore.ngp.native import native_shape
 from rfcore.ngp.shape import F32, NgpParameters
 
-__all__ = ["MAX_BLOCK_RAYS", "NgpRates", "RayBatch", "TrainableNgp"]
-
 MAX_BLOCK_RAYS = 256
 MAX_BLOCK_SAMPLES = 1 << 14
 STATE = ("table", "matrices", "table_m", "table_v", "matrices_m", "matrices_v", "peaks")

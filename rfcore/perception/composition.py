@@ -58,17 +58,6 @@ from rfcore.perception.patches import StandingPatch, draw_standing, in_front_of
 from rfcore.raster.gaussians import F32
 from rfcore.views import View
 
-__all__ = [
-    "ComposedView",
-    "LivePicture",
-    "Outline",
-    "compose",
-    "live_picture",
-    "nearest",
-    "shrunk",
-    "with_things",
-]
-
 T = TypeVar("T")
 
 MOST_CAMERAS, MOST_OF_ONE = 4, 2

@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.views import View
 
-__all__ = ["FieldGround", "GroundPlane", "points_of", "rays_of"]
-
 STEP_M, STEPS = 4.0, 6
 SIDE_STEP_M, HEIGHT_STEP_M, TURN_STEP_RAD = 2.0, 0.1, math.pi / 8
 LOOKING_DOWN_RAD = 0.25

@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 from rfcore.camera import Intrinsics, Pose
 from rfcore.motion import quaternion_from_vector
 
-__all__ = ["misplacement_rad"]
-
 WIDE = 80
 """Squares across a picture; with 80, errors of 5 degrees can be found."""
 ROUNDS = 24

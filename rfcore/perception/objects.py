@@ -32,16 +32,6 @@ from statistics import fmean
 from rfcore.perception.contacts import Detection
 from rfcore.perception.triangulation import Sighting, placed
 
-__all__ = [
-    "CameraKey",
-    "FollowedObject",
-    "ObjectReports",
-    "ObjectTracker",
-    "RulesOut",
-    "StreetObject",
-    "rules_nothing_out",
-]
-
 GATE_M = 1.5
 GATE_PER_M = 0.1
 REMEMBERED_S, MOST_REMEMBERED = 1.0, 12

@@ -36,8 +36,6 @@ from rfcore.native.live_view import (
 from rfcore.raster.gaussians import F32
 from rfcore.views import View
 
-__all__ = ["StandingPatch", "draw_standing", "in_front_of"]
-
 SAME_M = 1.5
 
 F64 = NDArray[np.float64]

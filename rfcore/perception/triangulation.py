@@ -30,8 +30,6 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["Placement", "Sighting", "placed"]
-
 SPEED_MPS = 10.0
 """Standard deviation of an object's velocity along each axis."""
 EVIDENCE = 4.0

@@ -15,17 +15,6 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 
-__all__ = [
-    "MAX_GAUSSIANS",
-    "SKY_M",
-    "Gaussians",
-    "empty_arrays",
-    "gaussian_shapes",
-    "joined",
-    "sky_of",
-    "with_sky_at",
-]
-
 MAX_GAUSSIANS = 50_000_000
 """Upper limit accepted from files: 11.8 GB of parameters at SH degree 3."""
 SKY_M = 1e4

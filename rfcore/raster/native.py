@@ -35,15 +35,6 @@ from rfcore.views import FieldView, HeldFieldView, View
 if TYPE_CHECKING:
     from rfcore.raster.opencl import DeviceRasterizer, DrawnPlane, LentBuffer
 
-__all__ = [
-    "RasterStatistics",
-    "Rasterizer",
-    "bands_to_use",
-    "check_renderer",
-    "native_camera",
-    "overlaps_limited",
-]
-
 log = structlog.get_logger()
 
 

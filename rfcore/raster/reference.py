@@ -26,8 +26,6 @@ with needs("reference"):
     from torch import Tensor
     from torch.nn import functional
 
-__all__ = ["loss_l1_dssim", "parameters", "render", "spherical_harmonics"]
-
 NEAR_M = 0.01
 """Gaussians whose centre is not beyond this depth are not drawn."""
 DILATION_PX2 = 0.3

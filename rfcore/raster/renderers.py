@@ -10,8 +10,6 @@ from threading import Lock
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["CPU", "DEVICES", "DeviceRecord", "is_opencl", "renderer_isa"]
-
 CPU, OPENCL = "cpu", "opencl"
 
 

@@ -22,15 +22,6 @@ from rfcore.raster.gaussians import F32, MAX_GAUSSIANS, Gaussians, empty_arrays
 from rfcore.raster.native import bands_to_use, native_camera, overlaps_limited
 from rfcore.views import View
 
-__all__ = [
-    "DEAD_LOGIT",
-    "DensityStep",
-    "Exposure",
-    "LearningRates",
-    "TrainableRasterizer",
-    "TrainingState",
-]
-
 DEAD_LOGIT = -5.293305
 """An opacity of 0.005; less is invisible on an 8-bit display."""
 DSSIM_WEIGHT = 0.2

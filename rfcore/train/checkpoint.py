@@ -19,8 +19,6 @@ from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field.archive import Archive, decode_archive, encode_archive, read_file
 from rfcore.files import write_whole
 
-__all__ = ["Checkpoint", "read_checkpoint", "write_checkpoint"]
-
 KIND = "checkpoint"
 
 

@@ -26,8 +26,6 @@ from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfcore.train.schedule import view_order
 
-__all__ = ["LevelFitConfig", "Progress", "fitted", "with_levels"]
-
 Progress = Callable[[int, int], None]
 """Called with the number of steps done and the number of all steps."""
 

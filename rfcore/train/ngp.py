@@ -40,16 +40,6 @@ from rfcore.train.targets import RaySampler, load_targets
 from rfcore.train.trainer import FieldTrainer, HeldOut, settings_of
 from rfcore.views import PointCloud, PosedPicture
 
-__all__ = [
-    "NgpModel",
-    "NgpSchedule",
-    "NgpTrainer",
-    "NgpTrainingConfig",
-    "cells_near",
-    "occupancy_cells",
-    "space_around",
-]
-
 MARGIN_SHARE = 0.01
 """Margin around the points in the box, as a share of its longest side."""
 KEPT_SHARE = 0.995

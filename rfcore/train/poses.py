@@ -31,15 +31,6 @@ from rfcore.raster.trainable import TrainableRasterizer
 from rfcore.train.targets import PictureAdam
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "PoseCorrection",
-    "PoseModel",
-    "align_pictures",
-    "corrected",
-    "pose_gradient",
-    "typical_depth_m",
-]
-
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 

@@ -19,16 +19,6 @@ from rfcore.errors import InvalidInput
 from rfcore.raster.gaussians import MAX_GAUSSIANS
 from rfcore.raster.trainable import DensityStep, LearningRates, TrainableRasterizer
 
-__all__ = [
-    "Bands",
-    "DensityControl",
-    "RateSchedule",
-    "Regularisation",
-    "control_density",
-    "is_order_due",
-    "view_order",
-]
-
 ORDER_INTERVAL = 500
 """Iterations between two sorts along the curve. A round of density control appends new Gaussians in
 the order of their sources, so the order degrades only over many rounds."""

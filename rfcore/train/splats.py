@@ -42,8 +42,6 @@ from rfcore.train.targets import ExposureModel, Target, halved, load_targets
 from rfcore.train.trainer import FieldTrainer, HeldOut, settings_of
 from rfcore.views import PointCloud, PosedPicture
 
-__all__ = ["SplatTrainer", "SplatTrainingConfig"]
-
 STATE_PARTS = ("gaussians", "first_moments", "second_moments")
 """Fields of ``TrainingState`` that have the shape of Gaussians."""
 

@@ -29,16 +29,6 @@ from rfcore.raster.gaussians import SKY_M, Gaussians
 from rfcore.train.targets import Target
 from rfcore.views import PointCloud, PosedPicture
 
-__all__ = [
-    "RandomStart",
-    "gaussians_from_points",
-    "points_from_depth",
-    "random_points",
-    "sky_gaussians",
-    "spacing_m",
-]
-
-
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 

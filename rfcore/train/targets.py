@@ -21,15 +21,6 @@ from rfcore.ngp.trainable import RayBatch
 from rfcore.raster.trainable import Exposure
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "ExposureModel",
-    "PictureAdam",
-    "RaySampler",
-    "Target",
-    "halved",
-    "load_targets",
-]
-
 F64 = NDArray[np.float64]
 EXPOSURE_RATE = 3e-3
 """Adam's rate at the start of the run: it learns a stop of exposure within some hundred visits."""

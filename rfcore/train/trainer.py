@@ -23,17 +23,6 @@ from rfcore.metrics import psnr, ssim
 from rfcore.train.checkpoint import Checkpoint
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "WINDOW",
-    "DivergenceWatch",
-    "FieldTrainer",
-    "HeldOut",
-    "TrainingProgress",
-    "held_out_quality",
-    "mean_psnr_db",
-    "settings_of",
-]
-
 WINDOW = 100
 """Iterations whose mean loss is compared."""
 TOLERATED_RISE = 1.5

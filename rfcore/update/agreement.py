@@ -24,8 +24,6 @@ from rfcore.native.yuv import i420_from_rgb
 from rfcore.update.passes import FEWEST_FRAMES, Pass, SeenFrame
 from rfcore.views import FieldView
 
-__all__ = ["both", "edge_correlation", "trusted_pixels", "without_outliers"]
-
 FAR_LEVELS = 20
 """Mean absolute difference of a block's luma above which it does not show the same as the field."""
 NEAR_LEVELS = 12

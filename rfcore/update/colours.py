@@ -44,8 +44,6 @@ from rfcore.update.agreement import trusted_pixels
 from rfcore.update.passes import SeenFrame
 from rfcore.update.splats import Progress
 
-__all__ = ["ColourFit", "colour_layer"]
-
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 FINEST_VOXELS, OTHER_VOXELS = (16.0, 3), (0.25, 1)

@@ -14,16 +14,6 @@ from rfcore.errors import InvalidInput
 from rfcore.train.targets import Target
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "FEWEST_FRAMES",
-    "HOLD_BACK_EVERY",
-    "Pass",
-    "SeenFrame",
-    "check_passes",
-    "split_frames",
-    "spread",
-]
-
 HOLD_BACK_EVERY = 4
 FEWEST_FRAMES = 8
 """Fewest frames of a pass: two of eight are held back, and not next to each other."""

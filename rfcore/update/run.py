@@ -19,8 +19,6 @@ from rfcore.update.passes import Pass, SeenFrame, check_passes, split_frames
 from rfcore.update.splats import FineTuning, Progress, fine_tuned
 from rfcore.update.trial import TRIAL_CRFS, saved_percent, try_field
 
-__all__ = ["LearnAs", "Update", "UpdateSettings", "learn", "learn_from"]
-
 
 class LearnAs(StrEnum):
     """The result of an update: another field; another field stored as its difference to the base

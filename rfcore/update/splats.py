@@ -25,8 +25,6 @@ from rfcore.train.schedule import DensityControl, control_density, view_order
 from rfcore.update.agreement import both, trusted_pixels
 from rfcore.update.passes import SeenFrame
 
-__all__ = ["FineTuning", "Progress", "fine_tuned"]
-
 Progress = Callable[[str, int, int], None]
 """Called with the present task, how much of it is done, and how much there is."""
 Mask = NDArray[np.bool_]

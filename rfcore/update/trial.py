@@ -21,8 +21,6 @@ from rfcore.field.interface import render_field_view
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.update.passes import SeenFrame
 
-__all__ = ["TRIAL_CRFS", "Trial", "saved_percent", "try_field"]
-
 TRIAL_CRFS = (22.0, 28.0, 34.0)
 HEADER_BYTES = 100
 """Approximate size of a packet with only its pose; without it a saving could be infinite."""

@@ -21,8 +21,6 @@ from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
 from rfcore.wire.checks import shown
 from rfcore.wire.tls import TlsFiles
 
-__all__ = ["Address", "check_handshake", "own_problem"]
-
 
 @dataclass(frozen=True)
 class Address:

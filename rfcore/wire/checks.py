@@ -11,22 +11,6 @@ import re
 from rfcore.errors import InvalidInput
 from rfcore.field.store import FIELD_ID
 
-__all__ = [
-    "FIELD_ID_PREFIX_BYTES",
-    "MAX_CAMERAS",
-    "MAX_FIELDS",
-    "MAX_LEVER_ARM_M",
-    "MAX_PAYLOAD_BYTES",
-    "MAX_RATE_HZ",
-    "MAX_TRANSLATION_M",
-    "check_absent_or",
-    "check_bytes",
-    "check_field_id",
-    "check_name",
-    "check_range",
-    "shown",
-]
-
 MAX_CAMERAS = 32
 """Cameras in one Hello: teleoperation has 4 (3GPP TS 22.156), the published rig 18."""
 

@@ -7,20 +7,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = [
-    "AGENT_PROCESS",
-    "CHANNEL_OPTIONS",
-    "CONSUMER_OPTIONS",
-    "FRAME_BUDGET_BUCKETS_S",
-    "MAX_MESSAGE_BYTES",
-    "RENDERER_CONTRACT",
-    "RETRY_AFTER",
-    "SERVER_OPTIONS",
-    "STREAM_METHOD",
-    "TILE",
-    "VEHICLE",
-]
-
 MAX_MESSAGE_BYTES: Final = 1 << 20
 """Longest message either end accepts; a longer one ends its stream, not the connection."""
 

@@ -55,14 +55,6 @@ from rfcore.wire.values import (
     references_to_wire,
 )
 
-__all__ = [
-    "FrameRefused",
-    "client_message_from_bytes",
-    "client_message_from_wire",
-    "client_message_to_bytes",
-    "client_message_to_wire",
-]
-
 
 class FrameRefused(InvalidInput):
     """One frame carries a value that cannot be; ``address`` says which frame."""

@@ -25,8 +25,6 @@ from rfcore.wire.messages import (
 from rfcore.wire.notices import StreetNotice, notice_from_wire, notice_to_wire
 from rfcore.wire.v1 import edge_pb2 as pb
 
-__all__ = ["server_messages_from_bytes", "server_messages_to_bytes"]
-
 REASONS = {reason: pb.RejectReason.Value(f"REJECT_REASON_{reason.name}") for reason in RejectReason}
 REASONS_BACK = {number: reason for reason, number in REASONS.items()}
 

@@ -23,8 +23,6 @@ from rfcore.wire.convert import client_message_from_wire, client_message_to_wire
 from rfcore.wire.messages import ClientMessage, Frame, Hello
 from rfcore.wire.v1 import edge_pb2 as pb
 
-__all__ = ["MAGIC", "CodedDrive", "read_drive", "write_drive"]
-
 MAGIC = b"RFV1\r\n\x1a\n"
 
 

@@ -20,8 +20,6 @@ from functools import lru_cache
 from rfcore.errors import AccessDenied, InvalidData, InvalidInput
 from rfcore.wire.checks import check_name, shown
 
-__all__ = ["PeerIdentity", "Role", "identity_uri", "parse_identity", "peer_identity"]
-
 PREFIX = "spiffe://rfedge/"
 CERTIFICATES = 512
 """Certificates that are not read again at each of their calls."""

@@ -36,8 +36,6 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.renderers import DEVICES, DeviceRecord
 from rfcore.wire.conventions import FRAME_BUDGET_BUCKETS_S, RENDERER_CONTRACT
 
-__all__ = ["DurationHistogram", "DurationSeries", "Family", "Instruments", "MetricsEndpoint"]
-
 UPPER_BOUNDS_S = (*FRAME_BUDGET_BUCKETS_S, math.inf)
 BUCKET_NAMES = tuple(map(floatToGoString, UPPER_BOUNDS_S))
 

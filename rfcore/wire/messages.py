@@ -18,23 +18,6 @@ from rfcore.views import FieldView
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.values import ClockKind
 
-__all__ = [
-    "Ack",
-    "CameraDescription",
-    "ClientMessage",
-    "Credit",
-    "DrainNotice",
-    "FieldNotice",
-    "Frame",
-    "FrameAddress",
-    "Hello",
-    "Nack",
-    "RendererContract",
-    "ServerMessage",
-    "StageTimes",
-    "Welcome",
-]
-
 
 @dataclass(frozen=True)
 class FrameAddress:

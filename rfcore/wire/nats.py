@@ -32,24 +32,6 @@ from rfcore.wire.address import Address
 from rfcore.wire.checks import check_field_id, check_name, check_range, shown
 from rfcore.wire.twin import PictureEncoding
 
-__all__ = [
-    "EXPIRES_S",
-    "FIELDS_BUCKET",
-    "PLACES_BUCKET",
-    "PLACE_HEADER",
-    "WANTED_EVERY_S",
-    "WANTED_S",
-    "NatsServers",
-    "VehicleLocation",
-    "VehicleLocations",
-    "key_of",
-    "picture_subject",
-    "pictures_subject",
-    "vehicle_of_subject",
-    "wanted_encoding",
-    "wanted_subject",
-]
-
 PLACES_BUCKET: Final = "rfedge-places"
 FIELDS_BUCKET: Final = "rfedge-fields"
 PLACE_HEADER: Final = "Rfedge-Place"

@@ -14,17 +14,6 @@ from rfcore.wire.checks import check_field_id, check_label, check_name, check_ra
 from rfcore.wire.v1 import edge_pb2 as pb
 from rfcore.wire.values import motion_from_wire, motion_to_wire, same_named
 
-__all__ = [
-    "NOTICE_KINDS",
-    "FieldChange",
-    "FieldChangeKind",
-    "ObjectAhead",
-    "StreetNotice",
-    "Subject",
-    "notice_from_wire",
-    "notice_to_wire",
-]
-
 OBJECT = "object"
 MAX_VALID_S = 3600.0
 MAX_AGE_MS = 2**32 - 1

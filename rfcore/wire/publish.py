@@ -28,8 +28,6 @@ from rfcore.wire.tile_manifest import (
 )
 from rfcore.wire.tiles import Area, Tile
 
-__all__ = ["Ground", "publish", "roll_back"]
-
 LOCK = ".tiles.lock"
 
 

@@ -24,16 +24,6 @@ from rfcore.files import DECODED_BYTES
 from rfcore.raster.renderers import CPU, renderer_isa
 from rfcore.wire.tls import TlsFiles
 
-__all__ = [
-    "OPTIONS",
-    "LogForm",
-    "MetricsSettings",
-    "RenderSettings",
-    "TransportSettings",
-    "configure_logs",
-]
-
-
 # How a service's configuration becomes options: flat names, words of enumerations as they
 # are in logs, and flags without a --no- twin.
 OPTIONS = (OmitArgPrefixes, EnumChoicesFromValues, FlagCreatePairsOff)

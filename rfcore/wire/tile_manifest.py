@@ -18,17 +18,6 @@ from rfcore.files import write_whole
 from rfcore.wire.checks import check_field_id, check_name
 from rfcore.wire.tiles import MAX_TILES, Area, Tile, TileLight
 
-__all__ = [
-    "MANIFEST",
-    "OWN_LIGHT",
-    "Publication",
-    "TileVersion",
-    "TileVersions",
-    "VersionLabel",
-    "read_publication",
-    "write_publication",
-]
-
 MANIFEST = "tiles.json"
 FORMAT = "rfedge tiles 1"
 

@@ -15,20 +15,6 @@ from rfcore.wire.checks import check_field_id, check_label, check_name, check_ra
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.values import same_named
 
-__all__ = [
-    "MAX_LIGHTS",
-    "MAX_TILES",
-    "PREVIEW",
-    "Area",
-    "LearntLight",
-    "Tile",
-    "TileLight",
-    "learnt_message",
-    "learnt_of",
-    "tile_message",
-    "tile_of",
-]
-
 MAX_TILES = 64
 """Tiles one server publishes."""
 MAX_LIGHTS = 7

@@ -15,8 +15,6 @@ import structlog
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["TlsFiles"]
-
 log = structlog.get_logger()
 
 

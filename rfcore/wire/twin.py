@@ -34,22 +34,6 @@ from rfcore.wire.values import (
     same_named,
 )
 
-__all__ = [
-    "MAX_WATCHED_VEHICLES",
-    "Departure",
-    "PictureEncoding",
-    "Subscription",
-    "TwinPicture",
-    "decoded_picture",
-    "encoded_picture",
-    "encoding_from_wire",
-    "encoding_to_wire",
-    "subscription_from_wire",
-    "subscription_to_wire",
-    "twin_message_from_wire",
-    "twin_message_to_wire",
-]
-
 MAX_WATCHED_VEHICLES: Final = 256
 """Vehicles one consumer may name; without naming any it sees all."""
 

@@ -36,8 +36,6 @@ from rfcore.wire.twin_render import (
 )
 from rfcore.wire.v1 import twin_pb2_grpc
 
-__all__ = ["AsyncTwinClient", "TwinClient", "twin_error"]
-
 CONNECT_S = 10.0
 RENDER_TIMEOUT_S = 30.0
 REFUSED = (

@@ -42,26 +42,6 @@ from rfcore.wire.values import (
     same_named,
 )
 
-__all__ = [
-    "DEFAULT_AGE_S",
-    "MAX_AGE_S",
-    "MAX_VIEW_PX",
-    "NO_AGE",
-    "LiveCamera",
-    "ObjectsRequest",
-    "ObjectsSeen",
-    "RenderedView",
-    "ViewRequest",
-    "objects_from_wire",
-    "objects_request_from_wire",
-    "objects_request_to_wire",
-    "objects_to_wire",
-    "rendered_view_from_wire",
-    "rendered_view_to_wire",
-    "view_request_from_wire",
-    "view_request_to_wire",
-]
-
 MAX_VIEW_PX: Final = 1920 * 1088
 LEAST_SIDE_PX: Final = 16
 LEAST_FOCAL, MOST_FOCAL = 0.1, 20.0

@@ -21,25 +21,6 @@ from rfcore.localise.estimate import LocalisationState
 from rfcore.wire.checks import check_range
 from rfcore.wire.v1 import edge_pb2 as pb
 
-__all__ = [
-    "ClockKind",
-    "clock_from_wire",
-    "clock_to_wire",
-    "intrinsics_from_wire",
-    "intrinsics_to_wire",
-    "localisation_from_wire",
-    "localisation_to_wire",
-    "motion_from_wire",
-    "motion_to_wire",
-    "pose_from_wire",
-    "pose_to_wire",
-    "quality_from_wire",
-    "quality_to_wire",
-    "references_from_wire",
-    "references_to_wire",
-    "same_named",
-]
-
 Value = TypeVar("Value")
 
 

@@ -15,24 +15,6 @@ from dataclasses import dataclass
 
 from rfcore.errors import BitstreamError, InvalidInput
 
-__all__ = [
-    "LOG2_MAX_FRAME_NUM",
-    "NAL_IDR",
-    "NAL_P",
-    "NAL_PPS",
-    "NAL_REF_IDC",
-    "NAL_SPS",
-    "BitReader",
-    "BitWriter",
-    "SliceStart",
-    "join_nals",
-    "nal_of_rbsp",
-    "nal_type",
-    "parse_slice_start",
-    "rbsp_of_nal",
-    "split_nals",
-]
-
 NAL_P, NAL_IDR, NAL_SPS, NAL_PPS = 1, 5, 7, 8
 NAL_REF_IDC = 3 << 5
 """nal_ref_idc 3 in the header byte of a NAL unit."""

@@ -15,25 +15,6 @@ from enum import StrEnum
 
 from rfcore.errors import InvalidInput
 
-__all__ = [
-    "CRF_RANGE",
-    "DEFAULT_EFFORT",
-    "EFFORTS",
-    "MAX_MACROBLOCKS",
-    "MAX_SIDE_PX",
-    "PRESETS",
-    "CodecConfig",
-    "Coder",
-    "CoderSettings",
-    "LightChange",
-    "check_crf",
-    "check_effort",
-    "coder_of",
-    "effort_of_preset",
-    "even_size_px",
-    "preset_of",
-]
-
 PRESETS = (
     "ultrafast",
     "superfast",

@@ -23,16 +23,6 @@ from rfcore.codec.h264.qp_map import Region
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
-__all__ = [
-    "EncoderOptions",
-    "H264Decoder",
-    "PictureKind",
-    "decode_clip",
-    "encode_pictures",
-    "picture_of",
-    "video_frame",
-]
-
 SIGNAL = MappingProxyType(
     {
         "colorprim": "bt709",

@@ -22,8 +22,6 @@ from rfcore.codec.h264.bitstream import (
 from rfcore.codec.h264.config import PICTURES_PER_SECOND, CodecConfig, Coder
 from rfcore.errors import InvalidInput
 
-__all__ = ["DEFAULT_REFERENCES", "INIT_QP", "StreamHeader", "check_header", "stream_header"]
-
 DEFAULT_REFERENCES = 3
 """References of a slice without an override in its header; most frames have three."""
 INIT_QP = 26

@@ -35,8 +35,6 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
 
-__all__ = ["PCM_PPS_ID", "PcmPictures", "PcmPlace", "pcm_pps", "without_zeros", "write_macroblocks"]
-
 PCM_PPS_ID = 1
 _I_SLICE_ONLY = 7
 _MB_TYPE_I_PCM = 25

@@ -25,16 +25,6 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.errors import InvalidInput
 from rfcore.image import read_rgb
 
-__all__ = [
-    "MB_PX",
-    "QP_OFFSET_RANGE",
-    "MaskSettings",
-    "QpMap",
-    "Region",
-    "check_qp_map",
-    "qp_map_of_mask",
-]
-
 MB_PX = 16
 QP_OFFSET_RANGE = (-24, 24)
 """A step 16 times finer or coarser; beyond it the quantiser always reaches an end of 0..51."""

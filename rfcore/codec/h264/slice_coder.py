@@ -35,8 +35,6 @@ from rfcore.image import I420
 from rfcore.native import _native
 from rfcore.native.backend import check_backend
 
-__all__ = ["Effort", "MacroblockMode", "OwnSlice", "SliceCoder"]
-
 LAMBDA_FACTOR = 0.59
 """Lambda at QP 12: the squared error that one bit is worth. It doubles every 3 steps of the
 quantiser. 0.68 takes 0.25 % more bits for the same squared error (a street with vehicles, 640x360),

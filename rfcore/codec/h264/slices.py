@@ -41,8 +41,6 @@ from rfcore.codec.h264.qp_map import QpMap
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
-__all__ = ["SliceCoding", "encode_slice", "slice_options"]
-
 _SUBME = {
     "ultrafast": 0,
     "superfast": 1,

@@ -21,8 +21,6 @@ from rfcore.codec.h264.pcm_picture import PcmPictures, PcmPlace, pcm_pps
 from rfcore.errors import BitstreamError, CodecError
 from rfcore.image import I420
 
-__all__ = ["PictureDecoder", "SpliceDecoder"]
-
 _P_SLICE, _I_SLICE = 0, 2
 
 

@@ -49,8 +49,6 @@ from rfcore.image import I420
 from rfcore.native.yuv import digest_pair
 from rfcore.views import FieldView
 
-__all__ = ["DeltaEncoder", "Encoded", "FrameChoice", "without_field"]
-
 
 @dataclass(frozen=True)
 class FrameChoice:

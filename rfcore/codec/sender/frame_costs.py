@@ -27,8 +27,6 @@ from rfcore.codec.h264.config import check_crf
 from rfcore.image import I420
 from rfcore.native.warp import BLOCK_PX, BlockCosts, block_costs
 
-__all__ = ["FrameCosts", "RateDistortion"]
-
 BLOCK_BITS = 1.0
 DEAD_ZONE_SATD = 16.0
 

@@ -28,16 +28,6 @@ from rfcore.codec.h264.config import (
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.field.quality import FULL, Quality
 
-__all__ = [
-    "FULL_RUNG",
-    "MeasuredRung",
-    "Rung",
-    "TrackingEffort",
-    "front",
-    "quality_name",
-    "read_ladder",
-]
-
 
 class TrackingEffort(StrEnum):
     """The effort of finding a frame's pose in the field, for senders that do; the best first."""

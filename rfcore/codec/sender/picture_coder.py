@@ -21,8 +21,6 @@ from rfcore.codec.h264.slices import SliceCoding, encode_slice
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
-__all__ = ["QP_OF_CRF", "CodedPicture", "CodingRequest", "PictureCoder", "picture_coder"]
-
 QP_OF_CRF = 6.5
 """Median of the QP at which our coder's squared error is x264's, less the CRF: 6.2 on the empty
 sample drive, 6.8 on the one with vehicles, from CRF 15 to 40."""

@@ -28,17 +28,6 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import BLOCK_PX
 
-__all__ = [
-    "MAX_TRIES",
-    "BitsCurve",
-    "FittedSlice",
-    "RateModel",
-    "RateTarget",
-    "bits_curve",
-    "code_to_fit",
-]
-
-
 CRF_STEP = 1.0
 LEAST_BITS = 400.0
 """Bits of a slice in which every block is copied from reference 0: a header, a run of skips, and an

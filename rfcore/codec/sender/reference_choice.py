@@ -22,14 +22,6 @@ from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
 from rfcore.image import I420
 from rfcore.native.warp import BLOCK_PX
 
-__all__ = [
-    "choose_photometric",
-    "choose_references",
-    "light_differs",
-    "relighting_pays",
-    "sending_light_pays",
-]
-
 INDEX_BITS = 1.0
 """Bits that a block pays for another reference than the first."""
 

@@ -17,18 +17,6 @@ from rfcore.extras import needs
 with needs("opencl"):
     import pyopencl as cl
 
-__all__ = [
-    "BUILDS",
-    "Build",
-    "Device",
-    "DeviceFull",
-    "DeviceLost",
-    "DeviceMemory",
-    "LentBuffer",
-    "build_device",
-    "find_device",
-]
-
 log = structlog.get_logger()
 
 SOURCES = (

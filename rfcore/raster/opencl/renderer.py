@@ -39,15 +39,6 @@ from rfcore.views import FieldView
 with needs("opencl"):
     import pyopencl as cl
 
-__all__ = [
-    "MAX_GROUP_ENTRIES",
-    "MAX_TILE_ENTRIES",
-    "MOST_HELD_BYTES",
-    "DeviceRasterizer",
-    "DeviceWarp",
-    "DrawnPlane",
-]
-
 TILE_SIDE_PX = 16
 MAX_GROUP_ENTRIES = 1 << 28
 """Overlaps of Gaussians and 64x64 pixels; the native kernels refuse more in the same words."""

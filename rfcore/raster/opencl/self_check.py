@@ -37,16 +37,6 @@ from rfcore.views import FieldView, View
 with needs("opencl"):
     import pyopencl as cl
 
-__all__ = [
-    "ARITHMETIC_DIGESTS",
-    "CHECKS",
-    "WARP_CASES",
-    "Check",
-    "WarpCase",
-    "check_device",
-    "open_device",
-]
-
 log = structlog.get_logger()
 _opened: dict[str, Device] = {}
 _lock = Lock()
