@@ -10,11 +10,14 @@ settings.register_profile("rfedge", deadline=None, suppress_health_check=[Health
 settings.load_profile("rfedge")
 
 SLOW_TEST_S = 120
-"""Time limit of a slow test that states none; pyproject.toml has that of the others."""
+"""Time limit of a slow test that states none, where --timeout does not either; pyproject.toml has
+that of the fast ones."""
 
 
 @pytest.hookimpl(trylast=True)  # after hooks that mark tests as slow
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("timeout") is not None:
+        return
     for item in items:
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_TEST_S))

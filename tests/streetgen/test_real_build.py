@@ -49,6 +49,7 @@ def build(scene: Scene, out: Path, size_px: tuple[int, int], workers: int, frame
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_a_pose_looks_the_same_in_every_frame(standing: Scene, tmp_path: Path) -> None:
     """The same place in frames 0 and 7 of the drive, in full size: at least 42 dB apart."""
     job = RenderJob(standing, tmp_path / "s", Sampling(16), chosen_backend(), 2, (640, 360))
@@ -62,6 +63,7 @@ def test_a_pose_looks_the_same_in_every_frame(standing: Scene, tmp_path: Path) -
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_two_workers_take_the_same_pictures_as_one(standing: Scene, tmp_path: Path) -> None:
     for workers in (1, 2):
         build(standing, tmp_path / str(workers), (64, 36), workers, "0:4")
@@ -75,6 +77,7 @@ def test_two_workers_take_the_same_pictures_as_one(standing: Scene, tmp_path: Pa
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     file = tmp_path / "driving.toml"
     file.write_text(SHORT.format(speed_mps=5.0))
