@@ -1,7 +1,6 @@
 """What is recorded of a drive: a line per picture, log lines for what went wrong, and metrics."""
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,6 @@ from cav_agent.handover import HandoverCause, ServedTile
 from cav_agent.metrics import AgentMetrics
 from cav_agent.rate_control import ByteBudget
 from rfcore.codec.sender.ladder import MeasuredRung, Rung
-from rfcore.errors import RejectReason
 from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.wire.address import Address
 from rfcore.wire.messages import StageTimes
@@ -133,28 +131,6 @@ def test_the_file_is_whole_up_to_the_last_picture_that_ended(
 # --- log lines
 
 
-def test_a_frame_that_was_answered_at_once_is_not_logged(
-    observer: DriveObserver, acked: FrameResult
-) -> None:
-    with capture_logs() as lines:
-        observer.ended(acked)
-    assert lines == []
-
-
-def test_a_refused_frame_is_logged_with_what_names_it_at_both_ends(
-    observer: DriveObserver, acked: FrameResult
-) -> None:
-    refused = replace(
-        acked, outcome=Outcome.NACKED, reason=RejectReason.CRC_MISMATCH, problem="0x1 != 0x2"
-    )
-    with capture_logs() as lines:
-        observer.ended(refused)
-    (line,) = lines
-    assert (line["event"], line["log_level"]) == ("frame nacked", "warning")
-    assert (line["session"], line["epoch"], line["seq"]) == ("5e5510", 0, 0)
-    assert (line["reason"], line["problem"]) == ("crc_mismatch", "0x1 != 0x2")
-
-
 def test_a_picture_dropped_before_it_was_coded_is_counted_and_not_logged(
     observer: DriveObserver, value: Value, make_capture: Callable[..., Capture]
 ) -> None:
@@ -180,19 +156,6 @@ def test_a_slice_coded_again_is_logged_unless_rate_control_asked_for_it(
     events = [line["event"] for line in lines]
     assert events == ["slice above the limit coded again"] * logged
     assert value("recoded_frames_total") == 1
-
-
-def test_a_fall_of_quality_and_its_rise_are_logged_with_what_the_path_carries(
-    observer: DriveObserver, acked: FrameResult
-) -> None:
-    assert acked.encoded is not None
-    with capture_logs() as lines:
-        for crf in (23.0, 25.0, 35.0, 23.0):
-            observer.ended(replace(acked, encoded=replace(acked.encoded, crf=crf)))
-    falls, rises = lines
-    assert (falls["event"], falls["crf_before"], falls["crf"]) == ("quality falls", 23.0, 35.0)
-    assert (rises["event"], rises["crf_before"], rises["crf"]) == ("quality rises", 35.0, 23.0)
-    assert (falls["target_bytes"], falls["proven_mbps"]) == (500, 2.0)
 
 
 def test_the_pose_feeds_time_offset_is_a_metric_and_logged_when_it_changed(
@@ -267,27 +230,3 @@ def test_a_vehicle_is_named_only_when_asked(metrics: AgentMetrics, value: Value)
     assert value("info", **named) is None
     metrics.identify("cav-7", "front")
     assert value("info", **named) == 1
-
-
-@pytest.mark.parametrize("outcome", list(Outcome))
-@pytest.mark.parametrize("problem", ["", "no answer to a frame within 1.4 s", "000123.png: gone"])
-def test_the_labels_of_a_frame_are_its_outcome_and_a_word_for_the_reason(
-    registry: CollectorRegistry,
-    metrics: AgentMetrics,
-    make_capture: Callable[..., Capture],
-    outcome: Outcome,
-    problem: str,
-) -> None:
-    """Whatever the problem says, a reason is one of a closed set."""
-    reasons: list[EndReason | RejectReason] = [*EndReason, *RejectReason]
-    for reason in reasons:
-        metrics.ended(FrameResult(make_capture(0), outcome, reason, problem))
-    labels = [
-        sample.labels
-        for family in registry.collect()
-        for sample in family.samples
-        if sample.name == "rfedge_agent_frames_total"
-    ]
-    assert {entry["result"] for entry in labels} == {str(outcome)}
-    assert {entry["reason"] for entry in labels} == {str(reason) for reason in reasons}
-    assert all(re.fullmatch("[a-z_]*", entry["reason"]) for entry in labels)

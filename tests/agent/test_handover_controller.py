@@ -203,14 +203,6 @@ async def test_every_picture_goes_to_the_tile_it_was_taken_on(drive: Drive, site
     assert site.captured(EAST) == [2, 3]
 
 
-async def test_a_result_is_counted_once(drive: Drive, registry: CollectorRegistry) -> None:
-    controller = drive(WEST, EAST)
-    await controller.run()
-    assert controller.counts == {"acked": 4}
-    labels = {"result": "acked", "reason": ""}
-    assert registry.get_sample_value("rfedge_agent_frames_total", labels) == 4
-
-
 async def test_a_handover_is_counted_and_closes_the_stream_that_was_left(
     drive: Drive, site: Site, registry: CollectorRegistry
 ) -> None:
@@ -331,27 +323,6 @@ async def test_one_of_two_streams_that_fails_is_held_back_and_tried_again(
     assert stream.is_streaming
     stream.close()
     await stream.wait_closed()
-
-
-async def test_a_field_is_prepared_once_for_all_streams_of_its_tile(site: Site) -> None:
-    prepared: list[ServedTile] = []
-
-    async def prepare(served: ServedTile) -> OpenStream:
-        prepared.append(served)
-        return await site.prepare(served)
-
-    stream = TileStream(WEST, prepare, Owner(), asyncio.Event())
-    for _ in range(3):
-        stream.prepare(0.0)
-    await asyncio.gather(*stream.tasks)
-    stream.collect()
-    for _ in range(2):
-        stream.open(0.0)
-        stream.close()
-        await stream.wait_closed()
-        stream.collect()
-    assert prepared == [WEST]
-    assert len(site.clients[WEST]) == 2
 
 
 async def test_a_drive_that_is_stopped_captures_no_more(drive: Drive, site: Site) -> None:

@@ -16,19 +16,11 @@ from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outc
 from cav_agent.rate_control import LEAST_CAMERA_SHARE, BitDivision, ByteBudget, RateControl
 from cav_agent.session import AgentSession
 from rfcore.camera import Pose
-from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.packet import DeltaPacket
-from rfcore.codec.references import RENDER_ONLY
-from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
-from rfcore.codec.sender.rate import RateModel, RateTarget
-from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
-from rfcore.field import load_field, render_field_view
 from rfcore.link import LinkProfile
 from rfcore.link.plan import read_link
 from rfcore.link.shaper import Link, LinkParts
-from rfcore.link.traces import TraceTransmission, read_mahimahi
-from rfcore.native.yuv import i420_from_rgb
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -94,34 +86,6 @@ class ModelCoder:
         packet = DeltaPacket(job.epoch, self.sequence, digest, b"", digest, payload, 0)
         self.sequence += 1
         return EncodedFrame(packet, {"encode": CODING_S}, Pose.identity(), crf=crf)
-
-
-class StreetCoder:
-    """x264 on the sample street, every picture against the field's render; keeps PSNR by index."""
-
-    def __init__(self) -> None:
-        field = load_field(Path("samples/fields/street.rff"), threads=2)
-        pictures = read_dataset(Path("samples/street/transforms_drive_vehicles.json")).pictures
-        self._frames = [i420_from_rgb(picture.read()) for picture in pictures]
-        self._views = [render_field_view(field, picture.camera) for picture in pictures]
-        self._encoder = DeltaEncoder(CodecConfig(640, 360, "fast", LOWEST_CRF))
-        self._state = self._encoder.start(0)
-        self._model = RateModel()
-        self.psnr_db: dict[int, float] = {}
-
-    def __call__(self, job: EncodeJob) -> EncodedFrame:
-        assert job.budget is not None
-        target = RateTarget(job.budget.target_bytes, self._model)
-        choice = FrameChoice(RENDER_ONLY, limit_bytes=job.budget.limit_bytes, target=target)
-        at = job.capture.index % len(self._frames)
-        frame = self._frames[at]
-        made = self._encoder.encode(self._state, frame, self._views[at], choice=choice)
-        self._state, self._model = made.state, made.rate or self._model
-        squares = np.mean((made.reconstruction.y.astype(float) - frame.y) ** 2)
-        self.psnr_db[job.capture.index] = float(10 * np.log10(255**2 / squares))
-        return EncodedFrame(
-            made.packet, {"encode": CODING_S}, Pose.identity(), tries=made.tries, crf=made.crf
-        )
 
 
 @dataclass
@@ -239,22 +203,6 @@ def test_a_rate_that_collapses_costs_quality_and_not_time(
     assert all(picture.payload_bytes == 0 for picture in dropped), "only before encoding"
 
 
-@pytest.mark.slow
-def test_on_a_street_a_collapse_costs_decibels_and_not_time(
-    drive_over: Callable[..., list[Picture]],
-) -> None:
-    street = StreetCoder()
-    pictures = drive_over(link((0, 10e6), (4, 0.3e6), (8, 10e6)), seconds=12, code=street)
-    for from_s, to_s in ((SETTLING_S, 4), (4 + SETTLING_S, 8), (8 + SETTLING_S, 12)):
-        assert kept(between(pictures, from_s, to_s), 0.2) == 1.0
-    psnr_db = [
-        np.mean([db for index, db in street.psnr_db.items() if a <= index / RATE_HZ < b])
-        for a, b in ((3, 4), (4 + SETTLING_S, 8), (11, 12))
-    ]
-    assert psnr_db[1] < psnr_db[0] - 1
-    assert psnr_db[2] > psnr_db[1] + 1
-
-
 def test_without_control_the_same_collapse_is_seconds_of_delay(
     drive_over: Callable[..., list[Picture]],
 ) -> None:
@@ -315,20 +263,6 @@ def test_when_a_recorded_link_stops_only_what_is_on_its_way_is_late(
     pictures = between(drive_over(plan.link(), 0.5, seconds=60), SETTLING_S, 60)
     coded = [picture.delay_s > 0.5 for picture in pictures if picture.delay_s is not None]
     assert not any(map(all, zip(coded, coded[1:], coded[2:], strict=False)))
-
-
-LTE = Path("../shared/data/traces/mahimahi/TMobile-LTE-short.up")
-
-
-@pytest.mark.skipif(not LTE.exists(), reason="the recorded LTE uplink is not here")
-def test_an_lte_uplink_is_kept_within_a_fifth_of_a_second(
-    drive_over: Callable[..., list[Picture]],
-) -> None:
-    uplink = Link[FrameAddress](
-        LinkProfile(1e6, 0.02, 2**40), LinkParts(TraceTransmission(read_mahimahi(LTE)))
-    )
-    pictures = drive_over(uplink, 0.2, seconds=120)
-    assert kept(between(pictures, SETTLING_S, 120), 0.2) >= 0.99
 
 
 def test_what_can_never_be_in_time_is_still_sent_small(

@@ -17,10 +17,8 @@ from cav_agent.frames import (
 )
 from cav_agent.session import AgentSession, LinkState, OutgoingMessage
 from rfcore.errors import InvalidInput, RejectReason, RfedgeError
-from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import (
     Ack,
-    ClientMessage,
     Credit,
     FieldNotice,
     Frame,
@@ -66,15 +64,6 @@ def test_a_connection_begins_with_hello_and_streams_after_welcome(hello: Hello) 
     assert session.state is LinkState.GREETING
     session.receive(Welcome("s-7", exact=True), 0.1)
     assert (session.state, session.session_id) == (LinkState.STREAMING, "s-7")
-
-
-def test_a_refused_hello_is_an_error_that_names_the_reason(hello: Hello) -> None:
-    session = AgentSession(hello)
-    session.connected(0.0)
-    problem = "codec.width_px: 640 px"
-    session.receive(Nack(FrameAddress("", 0, 0), RejectReason.INVALID_ARGUMENT, problem), 0.1)
-    assert session.failed is not None
-    assert problem in str(session.failed)
 
 
 def test_a_server_that_does_not_welcome_is_given_up(hello: Hello) -> None:
@@ -189,16 +178,6 @@ def test_after_a_nack_the_next_packet_begins_a_new_epoch(
     assert (after.packet.epoch, after.packet.sequence) == (1, 0)
 
 
-def test_several_nacks_of_one_epoch_begin_one_new_epoch(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    frames = [send(session, make_capture(i), encode) for i in range(2)]
-    for frame in frames:
-        session.receive(Nack(frame.address, RejectReason.DECODER_FAILED, "x"), 2.0)
-    session.receive(Credit("front", 4), 2.0)
-    assert send(session, make_capture(2), encode).packet.epoch == 1
-
-
 def test_a_server_in_a_later_epoch_is_overtaken(
     session: AgentSession, make_capture: MakeCapture, encode: Encode
 ) -> None:
@@ -214,14 +193,6 @@ def test_a_nack_of_a_gap_covers_all_its_sequences(
     frames = [send(session, make_capture(i), encode) for i in range(2)]
     session.receive(Nack(frames[0].address, RejectReason.SEQUENCE_GAP, "lost", count=2), 2.0)
     assert outcomes(session.take_results()) == [(0, "nacked"), (1, "nacked")]
-
-
-def test_an_unreadable_message_costs_what_is_on_its_way(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    send(session, make_capture(0), encode)
-    session.receive(Nack(FrameAddress("", 0, 0), RejectReason.INVALID_ARGUMENT, "garbage"), 2.0)
-    assert outcomes(session.take_results()) == [(0, "nacked")]
 
 
 def test_an_overloaded_server_loses_the_frame_without_judging_it(
@@ -308,32 +279,6 @@ def test_a_payload_no_server_would_take_is_dropped_here(
     assert result.problem.startswith("1000001 bytes of payload exceed")
 
 
-def test_a_frame_is_serialised_once_and_its_length_is_the_packets_size(
-    session: AgentSession,
-    make_capture: MakeCapture,
-    encode: Encode,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    serialised: list[ClientMessage] = []
-
-    def count(message: ClientMessage) -> bytes:
-        serialised.append(message)
-        return client_message_to_bytes(message)
-
-    monkeypatch.setattr("cav_agent.session.client_message_to_bytes", count)
-    session.offer(make_capture(0))
-    job = session.job_to_start(0.0)
-    assert job is not None
-    session.encoded(encode(job), 1.0)
-    (outgoing,) = session.messages_to_send(1.0)
-    assert isinstance(outgoing.message, Frame)
-    session.receive(ack(outgoing.message), 2.0)
-    (result,) = session.take_results()
-    assert serialised == [outgoing.message]
-    assert outgoing.data == client_message_to_bytes(outgoing.message)
-    assert result.packet_bytes == len(outgoing.data)
-
-
 def test_loading_a_picture_is_no_part_of_its_latency(
     session: AgentSession, make_capture: MakeCapture, encode: Encode
 ) -> None:
@@ -381,25 +326,6 @@ def test_an_abandoned_session_ends_every_picture_it_took(
     assert sorted(outcomes(results)) == [(0, "lost"), (1, "lost"), (2, "lost")]
     assert {result.reason for result in results} == {EndReason.ABANDONED}
     assert session.is_idle
-
-
-@pytest.mark.parametrize("answered_s", [0.02, 0.3, 0.9])
-def test_how_long_an_answer_was_waited_for_is_in_the_problem_and_not_in_the_reason(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode, answered_s: float
-) -> None:
-    """Reasons are values of a metric's label: a number would make a time series of each wait."""
-    session.receive(ack(send(session, make_capture(0), encode, now=1.0)), 1.0 + answered_s)
-    session.take_results()
-    send(session, make_capture(1), encode, now=2.0)
-    timer = session.get_timer()
-    assert timer is not None
-    session.handle_timer(timer)
-    assert session.broken is not None
-    assert session.broken.reason is EndReason.NO_ANSWER
-    assert session.broken.problem == f"no answer to a frame within {timer - 2.0:.2g} s"
-    session.connection_lost(session.broken, timer)
-    (result,) = session.take_results()
-    assert str(result.reason) == "no_answer"
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import grpc
-import pytest
 from structlog.testing import capture_logs
 
 from live_server import counted
@@ -65,17 +64,3 @@ async def test_a_refused_vehicle_comes_again_when_it_was_told_to(
             counts = (await travelling).counts
     assert set(counts) == {"acked"}
     assert any("come again" in line.get("problem", "") for line in logs)
-
-
-@pytest.mark.parametrize(("asked_hz", "granted_hz"), [(10.0, 10.0), (0.0, 0.0)])
-async def test_a_server_with_room_grants_what_was_asked_for(
-    serve: Callable[..., Any],
-    raw_vehicle: Callable[..., Any],
-    coded: Any,
-    asked_hz: float,
-    granted_hz: float,
-) -> None:
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        welcome = await vehicle.ask(asking(coded, "cav-1", asked_hz))
-        assert isinstance(welcome, Welcome)
-        assert welcome.rate_hz == granted_hz

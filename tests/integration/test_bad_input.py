@@ -5,12 +5,11 @@ from dataclasses import replace
 from typing import Any
 
 import grpc
-import pytest
 
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.messages import Ack, FieldNotice, Frame, Nack
+from rfcore.wire.messages import Ack, Frame, Nack
 from rfcore.wire.v1 import edge_pb2 as pb
 
 
@@ -92,25 +91,6 @@ async def test_no_flipped_bit_becomes_a_wrong_picture_even_when_its_crc_was_repa
             assert isinstance(answer, Nack)
 
 
-@pytest.mark.parametrize(
-    ("fields", "named"),
-    [
-        ({"x_m": float("inf")}, "pose.translation_m"),
-        ({"y_m": -3e6}, "pose.y_m: -3000000.0 is outside"),
-        ({"rotation_x": 0.5}, "pose.rotation: quaternion of norm 1.118"),
-        ({"rotation_w": float("nan")}, "pose.rotation"),
-    ],
-)
-async def test_a_bad_pose_is_an_invalid_argument_naming_the_field(
-    coded: Any, welcomed: Any, fields: dict[str, float], named: str
-) -> None:
-    identity = {"rotation_w": 1.0, "rotation_x": 0.0, "rotation_y": 0.0, "rotation_z": 0.0}
-    nack = await welcomed.ask(changed(coded.frames[0], **{**identity, **fields}))
-    assert isinstance(nack, Nack)
-    assert nack.problem.startswith(named)
-    assert await welcomed.told(coded.frames[0]) == ("ack", 0)
-
-
 async def test_a_hello_of_another_resolution_is_refused_by_name_and_may_be_corrected(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
@@ -136,18 +116,6 @@ async def test_a_hello_of_another_resolution_is_refused_by_name_and_may_be_corre
         assert await vehicle.told(coded.frames[0]) == ("ack", 0)
 
 
-async def test_an_unknown_field_ends_the_stream_with_both_ids_named(
-    street: Any, coded: Any, serve: Any, raw_vehicle: Any
-) -> None:
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        asked = replace(coded.hello, field_ids=(street.other_id,))
-        assert await vehicle.ask(asked) == FieldNotice((street.field_id,))
-        assert await vehicle.end() is grpc.StatusCode.NOT_FOUND
-        details = await vehicle.stream.details()
-        assert street.field_id in details
-        assert street.other_id in details
-
-
 async def test_an_oversize_message_ends_its_stream_and_no_other(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
@@ -158,28 +126,6 @@ async def test_an_oversize_message_ends_its_stream_and_no_other(
             await vehicle.say(bytes(2 << 20))
             assert await vehicle.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
         assert await other.told(coded.frames[0]) == ("ack", 0)
-
-
-async def test_a_vehicle_that_vanishes_leaves_the_others_alone(
-    coded: Any, serve: Any, raw_vehicle: Any
-) -> None:
-    async with serve() as server, raw_vehicle(server.address) as other:
-        await other.greet(replace(coded.hello, vehicle_id="cav-other"))
-        async with raw_vehicle(server.address) as vehicle:
-            await vehicle.greet(coded.hello)
-            await vehicle.say(coded.frames[0])
-            vehicle.stream.cancel()
-        assert await other.told(coded.frames[0]) == ("ack", 0)
-        assert await other.farewell() is grpc.StatusCode.OK
-
-
-async def test_a_frame_before_hello_is_a_failed_precondition(
-    coded: Any, serve: Any, raw_vehicle: Any
-) -> None:
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.say(coded.frames[0])
-        assert await vehicle.end() is grpc.StatusCode.FAILED_PRECONDITION
-        assert "before Hello" in await vehicle.stream.details()
 
 
 async def test_a_draining_server_answers_what_it_has_taken(coded: Any, welcomed: Any) -> None:

@@ -4,14 +4,11 @@ with another certificate, or another name, is served meanwhile."""
 import asyncio
 import hashlib
 import itertools
-import json
 import os
-import struct
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,23 +18,21 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from structlog.testing import capture_logs
 
-from live_server import Files, certificates, counted, held, limited, until, watch_call
+from live_server import Files, certificates, counted, held, limited, until
 from mec_server.config import AdmissionLimits, IdentityBudget, SessionLimits
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
-from mec_server.session import MAX_UNUSABLE, DecodeJob, OpenJob
+from mec_server.session import DecodeJob, OpenJob
 from rfcore.field import SplatField, save_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.messages import Ack, Frame, Hello, Nack, Welcome
-from rfcore.wire.publish import Ground, publish
+from rfcore.wire.messages import Ack, Frame, Hello, Nack
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.certs import Members
 
 EXHAUSTED = grpc.StatusCode.RESOURCE_EXHAUSTED
 SHORT = SessionLimits(stalled_s=0.3)
-NOW = datetime(2026, 11, 1, tzinfo=UTC)
 
 
 def named(hello: Hello, vehicle_id: str, cameras: int = 1, rate_hz: float = 0.0) -> Hello:
@@ -214,48 +209,7 @@ async def test_calls_of_any_service_that_stay_open_stop_at_a_budget(
         await until(lambda: held(server, "rpcs") == 0)
 
 
-async def test_one_identity_does_not_take_every_place_to_watch(
-    certs: Any, connect: Any, serve: Any
-) -> None:
-    async with serve(tls=certs("server")) as server, AsyncExitStack() as stack:
-        greedy = await stack.enter_async_context(connect(server, "consumer-watch"))
-        modest = await stack.enter_async_context(connect(server, "consumer-other"))
-        calls = [watch_call(greedy) for _ in range(8)]
-        await until(lambda: limited(server, "identity_watches") == 4)
-        call = watch_call(modest)
-        await until(lambda: held(server, "watches") == 5)
-        assert not call.done()
-        for greedy_call in calls:
-            greedy_call.cancel()
-
-
 # --- Hello: decoders, promises, openings
-
-
-async def test_cameras_are_charged_as_decoders_over_all_streams(
-    serve: Any, raw_vehicle: Any, coded: Any
-) -> None:
-    budget = IdentityBudget(decoders=16)
-    async with serve(identity_budget=budget) as server, AsyncExitStack() as stack:
-        ends = []
-        for number in range(3):
-            greedy = await stack.enter_async_context(raw_vehicle(server.address))
-            hello = named(coded.hello, "greedy", 16)
-            cameras = tuple(
-                replace(camera, camera_id=f"{camera.camera_id}-{number}")
-                for camera in hello.cameras
-            )
-            await greedy.say(replace(hello, cameras=cameras))
-            if number:
-                ends.append(await greedy.end())
-            else:
-                assert isinstance(await greedy.hear(), Welcome)
-        assert ends == [EXHAUSTED, EXHAUSTED]
-        assert limited(server, "identity_decoders") == 2
-        assert held(server, "decoders") == 16
-        modest = await stack.enter_async_context(raw_vehicle(server.address))
-        await modest.greet(coded.hello)
-        assert await modest.told(coded.frames[0]) == ("ack", 0)
 
 
 async def test_decoders_are_given_back_when_they_are_closed(
@@ -275,21 +229,6 @@ async def test_decoders_are_given_back_when_they_are_closed(
         assert held(server, "decoders") == 1, "it is being closed, and still takes a process"
         gate.set()
         await until(lambda: held(server, "decoders") == 0)
-
-
-async def test_a_hello_that_asks_for_everything_reserves_nothing(
-    serve: Any, raw_vehicle: Any, coded: Any
-) -> None:
-    async with (
-        serve() as server,
-        raw_vehicle(server.address) as greedy,
-        raw_vehicle(server.address) as modest,
-    ):
-        await greedy.greet(named(coded.hello, "greedy", 16, rate_hz=1000.0))
-        welcome = await modest.ask(named(coded.hello, "modest", rate_hz=10.0))
-        assert isinstance(welcome, Welcome)
-        assert welcome.rate_hz == 10.0
-        assert await modest.told(of_camera(coded.frames[0], "modest")) == ("ack", 0)
 
 
 async def test_openings_that_fail_again_and_again_make_their_vehicle_wait(
@@ -313,53 +252,7 @@ async def test_openings_that_fail_again_and_again_make_their_vehicle_wait(
             await other.greet(replace(coded.hello, vehicle_id="cav-other"))
 
 
-async def test_streams_that_end_with_unusable_frames_make_their_vehicle_wait(
-    serve: Any, raw_vehicle: Any, coded: Any
-) -> None:
-    damaged = replace(coded.frames[0], packet=replace(coded.frames[0].packet, crc32=1))
-
-    async def wasted_stream(server: Any) -> None:
-        async with raw_vehicle(server.address) as vehicle:
-            await vehicle.greet(coded.hello)
-            for _ in range(MAX_UNUSABLE):
-                await vehicle.say(damaged)
-            assert await vehicle.end() is EXHAUSTED
-            assert "could not be used" in await vehicle.stream.details()
-
-    async with serve() as server:
-        for _ in range(2):
-            await wasted_stream(server)
-        async with raw_vehicle(server.address) as honest:
-            await honest.greet(coded.hello)
-            assert await honest.told(coded.frames[0]) == ("ack", 0)
-        for _ in range(3):
-            await wasted_stream(server)
-        async with raw_vehicle(server.address) as vehicle:
-            await vehicle.say(coded.hello)
-            assert await vehicle.end() is EXHAUSTED
-            assert "3 openings of this vehicle came to nothing" in await vehicle.stream.details()
-        assert limited(server, "failed_openings") == 1
-
-
 # --- frames
-
-
-async def test_frames_beyond_the_granted_rate_are_refused_unrendered(
-    serve: Any, raw_vehicle: Any, coded: Any
-) -> None:
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.greet(named(coded.hello, "cav-raw", rate_hz=1.0))
-        frames = [
-            replace(
-                of_camera(frame, "cav-raw"), packet=replace(frame.packet, crc32=0, sequence=number)
-            )
-            for number, frame in enumerate([coded.frames[0]] * 20)
-        ]
-        told = [(await vehicle.told(frame))[0] for frame in frames]
-        assert told[:8] == ["crc_mismatch"] * 8, "what may be in flight"
-        assert set(told[8:]) <= {"overloaded", "crc_mismatch"}
-        assert told.count("overloaded") >= 8
-        assert limited(server, "camera_frames") == told.count("overloaded")
 
 
 async def test_a_frame_that_could_not_be_decoded_in_time_is_not_rendered(
@@ -515,62 +408,7 @@ async def test_answers_that_nobody_reads_end_the_stream(
         await until(lambda: held(server, "streams") == 0)
 
 
-async def test_log_lines_about_one_peer_are_limited_and_those_missing_are_counted(
-    serve: Any, raw_vehicle: Any, coded: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mec_server.ledger.peer_log.LINE_BURST", 10.0)
-    with capture_logs() as lines:
-        async with serve() as server, raw_vehicle(server.address) as vehicle:
-            await vehicle.greet(coded.hello)
-            for _ in range(64):
-                await vehicle.told(b"\xff rubbish")
-            assert await vehicle.end() is EXHAUSTED
-            suppressed = counted(server, "rfedge_server_log_lines_suppressed_total")
-    written = [line for line in lines if "peer" in line]
-    assert len(written) + suppressed == 67, "opened, welcomed, 64 refused, closed"
-    assert 10 <= len(written) < 40
-    missing = sum(line.get("suppressed", 0) for line in written)
-    assert missing <= suppressed
-
-
 # --- fields
-
-
-def malformed_archive() -> bytes:
-    """An archive whose digests are right and whose array has no size and a shape beyond memory."""
-    array = {
-        "name": "means",
-        "dtype": "<f4",
-        "shape": [0, 1 << 62],
-        "offset": 0,
-        "sha256": hashlib.sha256(b"").hexdigest(),
-    }
-    header = {"kind": "splats", "metadata": {}, "arrays": [array], "data_bytes": 0}
-    raw = json.dumps(header).encode()
-    prefix = struct.pack("<8sII32s16x", b"RFFIELD\0", 1, len(raw), hashlib.sha256(raw).digest())
-    return (prefix + raw).ljust(-(-(len(prefix) + len(raw)) // 64) * 64, b"\0")
-
-
-async def test_a_malformed_archive_that_is_published_stops_no_later_publication(
-    serve: Any, street: Any, tmp_path: Path
-) -> None:
-    folder = tmp_path / "published"
-    folder.mkdir()
-    first = publish(folder, "street", street.store / "street.rff", Ground(), NOW)
-    with capture_logs() as lines:
-        async with serve(fields=folder) as server:
-            data = malformed_archive()
-            bad_id = hashlib.sha256(data).hexdigest()
-            (folder / f"{bad_id}.rff").write_bytes(data)
-            manifest = folder / "tiles.json"
-            good = manifest.read_text()
-            manifest.write_text(good.replace(first.field_id, bad_id))
-            await until(lambda: told(lines, "publication not taken up"))
-            assert [tile.field_id for tile in server._published.tiles] == [first.field_id]
-            manifest.write_text(good)
-            publish(folder, "street", street.other_store / "other.rff", Ground(), NOW)
-            await until(lambda: told(lines, "publication taken up"))
-            assert [tile.field_id for tile in server._published.tiles] == [street.other_id]
 
 
 def told(lines: list[Any], event: str) -> bool:

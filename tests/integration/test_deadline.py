@@ -1,9 +1,7 @@
-"""A vehicle with a deadline and a server, as processes: a small one means a lower rung, and the
+"""A vehicle with a deadline and a server: a small one means a lower rung, and the
 server's pictures are still the vehicle's to the byte."""
 
-import asyncio
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -32,39 +30,13 @@ def write_ladder(path: Path, full_ms: float, low_ms: float) -> Path:
     return path
 
 
-async def drive(street: Any, tmp_path: Path, *more: str) -> list[dict[str, Any]]:
-    """Run server and vehicle as processes; return the vehicle's report."""
-    ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
-    start = asyncio.create_subprocess_exec
-    listening = ("--listen", "127.0.0.1:0", "--ready-file", str(ready))
-    server = await start(
-        sys.executable, "-m", "mec_server", "--fields", str(street.store), *listening
-    )
-    try:
-        while not ready.exists():
-            assert server.returncode is None
-            await asyncio.sleep(0.005)
-        given = {"server": ready.read_text().strip(), "drive": street.drive}
-        given |= {"fields": street.store, "field": street.field_id, "pace": "lockstep"}
-        given |= {"effort": "fast", "report": report}
-        arguments = [part for name, value in given.items() for part in (f"--{name}", str(value))]
-        agent = await start(sys.executable, "-m", "cav_agent", *arguments, *more)
-        assert await agent.wait() == 0
-    finally:
-        server.kill()
-        await server.wait()
-    return [json.loads(line) for line in report.read_text().splitlines()]
-
-
-@pytest.mark.parametrize(("deadline_ms", "first"), [(1, LOW), (60_000, FULL)])
+@pytest.mark.parametrize(("deadline_ms", "first"), [(1.0, LOW), (60_000.0, FULL)])
 async def test_a_small_deadline_chooses_a_lower_rung_and_the_pictures_stay_equal(
-    street: Any, tmp_path: Path, deadline_ms: int, first: str
+    serve: Any, travel: Any, tmp_path: Path, deadline_ms: float, first: str
 ) -> None:
     ladder = write_ladder(tmp_path / "ladder.json", 1e3, 1e-3)
-    lines = await drive(
-        street, tmp_path, "--deadline-ms", str(deadline_ms), "--ladder", str(ladder)
-    )
-    assert lines
+    async with serve() as server:
+        lines = (await travel(server.address, deadline_ms=deadline_ms, ladder=ladder)).lines
     assert lines[0]["rung"] == first
     if first == LOW:
         assert {line["rung"] for line in lines} == {LOW}

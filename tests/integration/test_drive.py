@@ -16,7 +16,6 @@ from recorded import recorded, recorded_parts
 from rfcore.codec.h264.config import CoderSettings, LightChange
 from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.dataset import read_dataset
-from rfcore.errors import BackendUnavailable
 from rfcore.image import I420, read_rgb, write_png
 from rfcore.native.backend import available_isas
 from rfcore.wire.settings import RenderSettings
@@ -131,37 +130,6 @@ async def test_two_vehicles_share_a_server_and_a_field(
         assert [picture.digest for picture in recorded(tmp_path, name)] == digests
 
 
-async def test_the_report_keeps_the_sizes_apart_and_says_where_the_time_went(
-    serve: Any, travel: Any
-) -> None:
-    async with serve() as server:
-        record = await travel(server.address)
-    for number, line in enumerate(record.lines):
-        assert (line["sequence"], line["epoch"], line["result"]) == (number, 0, "acked")
-        assert line["name"].endswith(f"{number:03}.png")
-        assert 0 < line["payload_bytes"] < line["packet_bytes"] < line["payload_bytes"] + 260
-        assert line["server_digest"] == line["reconstruction_digest"]
-        assert len(bytes.fromhex(line["render_digest"])) == 16
-        own = {"read", "convert", "render", "references", "encode", "closed_loop", "link"}
-        server_s = {f"server_{s}" for s in ("queue", "render", "splice", "decode", "total")}
-        assert set(line["stage_ms"]) == own | server_s
-        assert all(spent_ms >= 0 for spent_ms in line["stage_ms"].values())
-        assert line["latency_ms"] >= line["stage_ms"]["encode"] + line["stage_ms"]["server_total"]
-
-
-async def test_a_drive_through_the_link_is_whole_and_its_wire_bytes_exceed_its_packets(
-    serve: Any, travel: Any
-) -> None:
-    async with serve() as server:
-        proxy = LinkProxy(ProxySettings(str(server.address), delay_ms=1.0))
-        await proxy.start()
-        record = await travel(proxy.address)
-        await proxy.stop()
-    assert record.counts == {"acked": 6}
-    uplink = proxy.report()["uplink"]
-    assert uplink["bytes"] > sum(line["packet_bytes"] for line in record.lines)
-
-
 async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_encoded(
     serve: Any, travel: Any
 ) -> None:
@@ -226,12 +194,6 @@ async def test_the_server_counts_frames_bytes_and_seconds(
             assert value(f"rfedge_server_{whole}_seconds_count") == 6
         prefix = street.field_id[:16]
         assert value("rfedge_server_field_info", {"field": prefix, "kind": "splats"}) == 1
-
-
-async def test_a_server_that_forces_a_missing_instruction_set_does_not_start(serve: Any) -> None:
-    with pytest.raises(BackendUnavailable):
-        async with serve(render=RenderSettings(isa="neon")):
-            pass
 
 
 def after_sunset(drive: Path, folder: Path) -> Path:

@@ -76,11 +76,6 @@ async def test_tiles_of_one_field_share_what_is_prepared(street: Any, config: Ag
     assert len(west.pictures) == 6
 
 
-async def test_a_field_that_is_here_needs_no_server(street: Any, config: AgentConfig) -> None:
-    prepared = await cache_of(config).prepared(served(street.field_id))
-    assert prepared.rungs.current.effort == "fast"
-
-
 async def test_a_failure_is_not_kept(street: Any, config: AgentConfig, tmp_path: Path) -> None:
     config = replace(config, fields=tmp_path)
     cache, servers = cache_and_connections(config)

@@ -21,7 +21,7 @@ from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tool
 from mec_server.session import DecodeJob, OpenJob
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.wire.conventions import AGENT_PROCESS
-from rfcore.wire.messages import Ack, Frame, Hello
+from rfcore.wire.messages import Ack, Hello
 
 EVERYBODY = AdmissionLimits(load=0.0)
 SAME_AGENT = ((AGENT_PROCESS, "the same"),)
@@ -57,32 +57,12 @@ def watched(before: Callable[[str, DecodeJob], None]) -> Callable[..., dict[str,
     return opened
 
 
-def damaged(frame: Frame) -> Frame:
-    return replace(frame, packet=replace(frame.packet, crc32=frame.packet.crc32 ^ 1))
-
-
 def with_cameras(hello: Hello, vehicle_id: str, camera_ids: list[str]) -> Hello:
     cameras = tuple(replace(hello.cameras[0], camera_id=name) for name in camera_ids)
     return replace(hello, vehicle_id=vehicle_id, cameras=cameras)
 
 
 # --- frames
-
-
-async def test_nothing_is_rendered_for_a_damaged_or_a_stale_packet(
-    coded: Any, serve: Any, raw_vehicle: Any
-) -> None:
-    rendered: list[int] = []
-    opened = watched(lambda _, job: rendered.append(job.frame.packet.sequence))
-    frames = coded.frames
-    async with serve(opened) as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.greet(coded.hello)
-        sent = [damaged(frames[0]), frames[0], frames[0], damaged(frames[1]), frames[1]]
-        told = [await vehicle.told(frame) for frame in sent]
-    assert [answer for answer, _ in told] == [
-        "crc_mismatch", "ack", "stale_sequence", "crc_mismatch", "ack",
-    ]  # fmt: skip
-    assert rendered == [0, 1]
 
 
 async def test_a_frame_waits_for_at_most_one_more_of_a_vehicle_that_has_many_waiting(
@@ -171,34 +151,6 @@ async def test_openings_of_streams_that_are_over_are_dropped_and_delay_nobody(
     assert opened_for == ["cav-first", "cav-last"]
 
 
-async def test_openings_of_one_vehicle_delay_another_by_at_most_one(
-    coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened_for: list[str] = []
-    gate = threading.Event()
-
-    def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
-        opened_for.append(job.hello.vehicle_id)
-        assert gate.wait(30)
-        return open_cameras(job, fields, tools)
-
-    async with AsyncExitStack() as stack, serve(opened, admission=EVERYBODY) as server:
-        asked = submissions(server, monkeypatch)
-        streams = []
-        for name in ["cav-greedy"] * 5 + ["cav-modest"]:
-            vehicle = await stack.enter_async_context(
-                raw_vehicle(server.address, metadata=SAME_AGENT)
-            )
-            await vehicle.say(replace(coded.hello, vehicle_id=name))
-            streams.append(vehicle)
-            await until(lambda: len(asked) == len(streams))
-        gate.set()
-        for vehicle in streams:
-            await vehicle.hear()
-    assert opened_for[:3].count("cav-modest") == 1
-    assert opened_for.count("cav-greedy") == 5
-
-
 async def test_a_stream_that_ends_halfway_through_its_opening_opens_no_more_decoders(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
@@ -221,16 +173,6 @@ async def test_a_stream_that_ends_halfway_through_its_opening_opens_no_more_deco
         gate.set()
         await until(lambda: counted(server, OPENINGS, result="cancelled") == 1)
     assert len(started) == 1
-
-
-async def test_an_opening_that_fails_is_counted(coded: Any, serve: Any, raw_vehicle: Any) -> None:
-    header = coded.hello.cameras[0].codec
-    camera = replace(coded.hello.cameras[0], codec=replace(header, sps=header.sps[:-2]))
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.ask(replace(coded.hello, cameras=(camera,)))
-        assert counted(server, OPENINGS, result="failed") == 1
-        assert counted(server, FAILURES, task="opening") == 0, "a bad value is no surprise"
-        await vehicle.greet(coded.hello)
 
 
 def submissions(server: Any, monkeypatch: pytest.MonkeyPatch) -> list[str]:

@@ -16,12 +16,10 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-import grpc
 import pytest
-from grpc_health.v1 import health_pb2, health_pb2_grpc
 from structlog.testing import capture_logs
 
-from cav_agent.config import AgentConfig, AgentLimits, PaceKind
+from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.vehicle import Vehicle
 from mec_server.config import ServerConfig
 from mec_server.server import EdgeServer
@@ -188,63 +186,12 @@ async def test_a_users_mistake_is_one_line_and_exit_2(
     assert named in lines[0]
 
 
-async def test_an_option_outside_its_limits_is_refused_before_anything_starts(
-    street: Any, tmp_path: Path
-) -> None:
-    arguments = agent_arguments(street, "127.0.0.1:1", tmp_path / "report.jsonl")
-    arguments[arguments.index("--rate") + 1] = "0"
-    agent = await start("cav_agent", *arguments)
-    _, told = await agent.communicate()
-    assert agent.returncode == 2
-    assert "rate: 0.0 Hz is outside 0.01..1000 Hz" in told.decode()
-    assert "Traceback" not in told.decode()
-    assert not (tmp_path / "report.jsonl").exists()
-
-
 @pytest.mark.parametrize("module", ["cav_agent.__main__", "mec_server.__main__"])
 def test_the_services_load_no_heavy_library(module: str) -> None:
     code = f"import sys, {module}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert not loaded & {"torch", "cv2", "matplotlib", "mitsuba", "jinja2"}
-
-
-async def test_no_server_is_an_error_after_the_time_allowed(street: Any) -> None:
-    config = AgentConfig(
-        "127.0.0.1:1",
-        street.drive,
-        street.store,
-        field=street.field_id,
-        coding=CoderSettings(effort="fast"),
-        limits=AgentLimits(give_up_s=0.3),
-    )
-    with pytest.raises(RfedgeError, match=r"no server welcomed this vehicle within 0\.3 s"):
-        await Vehicle(config).run()
-
-
-async def test_health_is_serving_until_the_server_drains(serve: Any) -> None:
-    async with serve() as server, grpc.aio.insecure_channel(str(server.address)) as channel:
-        stub = health_pb2_grpc.HealthStub(channel)
-        request = health_pb2.HealthCheckRequest(service="rfcore.wire.v1.EdgeService")
-        watch = stub.Watch(request)
-        first = await watch.read()
-        assert first.status == health_pb2.HealthCheckResponse.SERVING
-        stopping = asyncio.create_task(server.stop())
-        second = await watch.read()
-        assert second.status == health_pb2.HealthCheckResponse.NOT_SERVING
-        watch.cancel()
-        await stopping
-
-
-async def test_a_disk_that_refuses_stops_the_recording_and_not_the_streaming(
-    serve: Any, travel: Any, tmp_path: Path
-) -> None:
-    (tmp_path / "cav-1").write_text("a file where the pictures' folder should be")
-    async with serve(record=tmp_path) as server:
-        assert server.registry.get_sample_value("rfedge_server_recording") == 1
-        record = await travel(server.address)
-    assert record.counts == {"acked": 6}
-    assert server.registry.get_sample_value("rfedge_server_recording") == 0
 
 
 async def test_plaintext_is_served_to_this_machine_only_unless_allowed(serve: Any) -> None:
@@ -257,32 +204,6 @@ async def test_plaintext_is_served_to_this_machine_only_unless_allowed(serve: An
         transport=TransportSettings(allow_insecure=True),
     ) as server:
         assert server.address.port > 0
-
-
-async def test_a_second_agent_of_a_vehicle_is_refused_says_why_and_harms_nobody(
-    serve: Any, vehicle: Any, street: Any, tmp_path: Path
-) -> None:
-    async with serve() as server, vehicle(server.address, loop=True) as driving:
-        await driving.until(lambda: driving.acked() >= 1)
-        arguments = agent_arguments(street, str(server.address), tmp_path / "second.jsonl")
-        second = await start("cav_agent", *arguments)
-        refused = b"camera_taken: another agent sends camera front of vehicle cav-1; stop it"
-        async with asyncio.timeout(60):
-            while refused not in (line := await second.stderr.readline()):
-                assert line, "it ended without saying why"
-        second.terminate()
-        await second.communicate()
-        seen = driving.acked()
-        await driving.until(lambda: driving.acked() >= seen + 3)
-    assert {line["result"] for line in driving.lines()} == {"acked"}
-
-
-async def test_a_taken_port_is_one_clear_error(serve: Any) -> None:
-    async with serve() as server:
-        named = rf"cannot listen on {server.address}: Address already in use"
-        with pytest.raises(RfedgeError, match=named):
-            async with serve(listen=str(server.address)):
-                pass
 
 
 @pytest.mark.parametrize("option", ["--listen", "--metrics-port"])
@@ -351,10 +272,3 @@ async def test_a_server_without_fields_warns_and_takes_up_those_that_come(
                 while not any(line["event"] == "fields listed" for line in logs):
                     await asyncio.sleep(0.02)
             assert (await travel(server.address)).counts == {"acked": 6}
-
-
-async def test_a_server_with_fields_does_not_warn(serve: Any) -> None:
-    with capture_logs() as logs:
-        async with serve():
-            pass
-    assert NO_FIELDS not in {line["event"] for line in logs}

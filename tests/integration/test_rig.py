@@ -29,7 +29,6 @@ from rfcore.views import View
 from tests.integration.conftest import FRAMES, Street, write_rig_drives
 
 CAMERA = "[camera]\nwidth_px = 76\nheight_px = 52\nfx_px = 50.0\ncx_px = 38.0\ncy_px = 26.0\n"
-HELD_DECODERS = ("rfedge_server_held", {"resource": "decoders"})
 
 
 @pytest.fixture(scope="module")
@@ -214,15 +213,3 @@ async def test_the_live_cameras_of_a_rig_are_sent_together_without_the_one_that_
         assert world_from_rig.translation_m[0] == pytest.approx(
             -0.25 * world_from_rig.translation_m[2], abs=0.02
         ), (instant, camera_id)
-
-
-@pytest.mark.slow
-async def test_eighteen_cameras_are_accepted_and_served(
-    serve: Any, vehicle: Any, street: Street, tmp_path: Path
-) -> None:
-    file = write_rig_drives(tmp_path / "rig", street.field, 18)
-    async with serve() as server, vehicle(server.address, drive=None, rig=file) as driving:
-        await driving.until(lambda: driving.acked() > 0)
-        assert server.registry.get_sample_value(*HELD_DECODERS) == 18
-        counts = await driving.end()
-    assert counts == Counter(acked=18 * FRAMES)

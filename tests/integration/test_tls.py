@@ -16,14 +16,7 @@ from live_server import Files, certificates, channel_to, watch_call
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
 from rfcore.wire.address import own_problem
 from rfcore.wire.conventions import STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.tls import TlsFiles
-from rfcore.wire.twin import (
-    PictureEncoding,
-    Subscription,
-    TwinPicture,
-    twin_message_from_wire,
-)
 from rfcore.wire.twin_client import TwinClient
 from rfedge.certs import Members, certify, write_certificates
 
@@ -76,21 +69,6 @@ async def test_a_vehicle_may_not_go_by_another_name_than_its_certificates(
         with pytest.raises(ProtocolError, match="'cav-1' is not whom its certificate names") as e:
             await travel(server.address, tls=certs(name))
     assert f"spiffe://rfedge/{name.replace('-', '/', 1)}" in str(e.value)
-
-
-async def test_a_false_name_is_permission_denied_and_leaves_the_others_alone(
-    certs: Files, serve: Any, travel: Any, coded: Any
-) -> None:
-    async with (
-        serve(tls=certs("server")) as server,
-        channel_to(server.address, certs("vehicle-cav-2")) as channel,
-    ):
-        stream = channel.stream_stream(STREAM_METHOD)()
-        await stream.write(client_message_to_bytes(coded.hello))
-        assert await stream.code() is grpc.StatusCode.PERMISSION_DENIED
-        assert "'cav-raw' is not whom its certificate names" in (await stream.details() or "")
-        record = await travel(server.address, tls=certs("vehicle-cav-1"))
-    assert record.counts == {"acked": 6}
 
 
 async def test_an_expired_vehicle_is_told_so_in_one_line(
@@ -215,24 +193,6 @@ async def test_half_of_a_new_certificate_is_not_taken_up(
         )
         record = await travel(server.address, tls=certs("vehicle-cav-1"))
     assert record.counts == {"acked": 6}
-
-
-async def test_a_consumer_asks_for_health_and_sees_the_drive(
-    certs: Files, serve: Any, travel: Any
-) -> None:
-    async with (
-        serve(tls=certs("server")) as server,
-        channel_to(server.address, certs("consumer-watch")) as channel,
-    ):
-        health = await health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest())
-        assert health.status == health_pb2.HealthCheckResponse.SERVING
-        subscription = Subscription(encoding=PictureEncoding.NONE)
-        call = watch_call(channel, subscription)
-        await call.initial_metadata()
-        await travel(server.address, tls=certs("vehicle-cav-1"))
-        seen = twin_message_from_wire(await call.read())
-        assert isinstance(seen, TwinPicture)
-        assert seen.vehicle_id == "cav-1"
 
 
 def test_a_watcher_in_plaintext_is_told_what_is_missing(

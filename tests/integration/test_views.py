@@ -14,15 +14,13 @@ import grpc
 import numpy as np
 import pytest
 
-from mec_server.config import RenderSettings, ServerBudget, SessionLimits
-from mec_server.fields import index
+from mec_server.config import ServerBudget, SessionLimits
 from mec_server.ledger.budgets import Limit, Resource
 from mec_server.twin import rendering
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import LimitExceeded
-from rfcore.field import SplatField, save_field
+from rfcore.field import save_field
 from rfcore.perception import contacts
-from rfcore.views import View
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.messages import Frame
 from rfcore.wire.publish import Ground, publish
@@ -105,70 +103,6 @@ async def test_a_view_is_the_field_with_what_a_vehicle_sees_now(
     assert set(np.unique(view.age_ms)) == {round(1e3 * camera.age_s), NO_AGE}
     assert gone.live.any(), "a vehicle that left fades, it does not vanish"
     assert gone.cameras[0].age_s > camera.age_s
-
-
-async def test_a_picture_is_compared_with_the_decoders_own_render(
-    street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Beside the view itself nothing is drawn at full size, and what it is compared with is to the
-    bit what would have been drawn."""
-    compared: list[tuple[Camera, View]] = []
-    drawn: list[Camera] = []
-    live_picture, render = rendering.live_picture, SplatField.render
-
-    def noted(camera: Camera, rgb: Any, view: View) -> Any:
-        compared.append((camera, view))
-        return live_picture(camera, rgb, view)
-
-    def counted(field: SplatField, camera: Camera, *rest: Any) -> View:
-        if camera.intrinsics == INTRINSICS:
-            drawn.append(camera)
-        return render(field, camera, *rest)
-
-    aside = Camera(INTRINSICS, Pose((0.05, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
-    request = view_request_to_wire(asked(street, aside))
-    async with (
-        serve() as server,
-        stub_of(server) as stub,
-        raw_vehicle(server.address) as vehicle,
-    ):
-        await vehicle.greet(coded.hello)
-        await vehicle.told(coded.frames[0])
-        monkeypatch.setattr(rendering, "live_picture", noted)
-        monkeypatch.setattr(SplatField, "render", counted)
-        await stub.Render(request)
-        monkeypatch.setattr(SplatField, "render", render)
-    assert drawn == [aside]
-    ((camera, view),) = compared
-    expected = street.field.render(camera)
-    for name in ("colour", "depth", "opacity"):
-        assert np.array_equal(getattr(view, name), getattr(expected, name)), name
-
-
-async def test_views_share_the_field_that_pictures_are_decoded_against(
-    street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read: list[Path] = []
-    load_checked = index.load_checked
-
-    def noted(path: Path, *rest: Any, **changes: Any) -> Any:
-        read.append(path)
-        return load_checked(path, *rest, **changes)
-
-    monkeypatch.setattr(index, "load_checked", noted)
-    async with (
-        serve(render=RenderSettings(threads=3)) as server,
-        stub_of(server) as stub,
-        raw_vehicle(server.address) as vehicle,
-    ):
-        await vehicle.greet(coded.hello)
-        rendered = await stub.Render(view_request_to_wire(asked(street)))
-    assert len(read) == 1
-    assert rendered.field_id == street.field_id
-
-
-def turned_away(**changes: Any) -> Camera:
-    return replace(ORIGIN, intrinsics=replace(INTRINSICS, **changes))
 
 
 FAR = Camera(INTRINSICS, Pose((0.0, 0.0, -40.0), (1.0, 0.0, 0.0, 0.0)))

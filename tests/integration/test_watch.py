@@ -3,8 +3,6 @@
 import asyncio
 import doctest
 import json
-import signal
-import subprocess
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -17,7 +15,7 @@ import pytest
 
 from live_server import consumer
 from mec_server.config import ServerBudget, SessionLimits
-from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.errors import InvalidInput
 from rfcore.image import read_rgb
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.twin import (
@@ -28,7 +26,6 @@ from rfcore.wire.twin import (
     twin_message_from_wire,
 )
 from rfcore.wire.twin_client import TwinClient
-from rfedge.processes import command_of
 from rfedge.watch import WatchSettings, watch
 
 
@@ -221,36 +218,6 @@ async def test_the_watch_command_keeps_pictures_and_a_video(
     captured = [line["capture_time_ns"] for line in index]
     assert times == pytest.approx([(t - captured[0]) / 1e9 for t in captured], abs=2e-5)
     assert capsys.readouterr().out.count("cav-1/front 0:") == 4
-
-
-async def test_a_watcher_that_is_told_to_stop_leaves_a_whole_video(
-    serve: Any, travel: Any, tmp_path: Path
-) -> None:
-    async with serve() as server:
-        value = server.registry.get_sample_value
-        watcher = await asyncio.create_subprocess_exec(
-            *command_of("rfedge"), "watch", str(server.address), "--mp4", str(tmp_path / "v.mp4"),
-            stdout=subprocess.PIPE,
-        )  # fmt: skip
-        while not value("rfedge_twin_consumers"):
-            await asyncio.sleep(0.01)
-        await travel(server.address)
-        assert watcher.stdout is not None
-        while b"left" not in await watcher.stdout.readline():
-            pass
-        watcher.send_signal(signal.SIGTERM)
-        await watcher.communicate()
-        assert watcher.returncode == 0
-    with av.open(str(tmp_path / "v.mp4")) as container:
-        assert 1 <= len(list(container.decode(video=0))) <= 6
-
-
-async def test_a_server_that_refuses_a_watcher_is_one_clear_error(
-    serve: Any, watch_command: Any
-) -> None:
-    async with serve(server_budget=ServerBudget(watches=0)) as server:
-        with pytest.raises(RfedgeError, match="identity_watches: this identity has 0 watches"):
-            await watch_command(server.address)
 
 
 @pytest.mark.parametrize(

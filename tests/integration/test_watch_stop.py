@@ -145,12 +145,6 @@ def test_a_watcher_ends_while_it_waits_for_a_server_or_for_pictures(
 NOWHERE = "127.0.0.1:1"
 
 
-def test_without_a_server_the_error_names_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(twin_client, "CONNECT_S", 0.05)
-    with pytest.raises(RfedgeError, match=r"no server at 127\.0\.0\.1:1 within 0\.05 s"):
-        module.watch(WatchSettings(), TwinClient(NOWHERE))
-
-
 @pytest.fixture
 def handlers() -> Iterator[None]:
     """The handlers of the test's own process are in place again afterwards."""

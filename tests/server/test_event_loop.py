@@ -230,29 +230,6 @@ async def test_while_others_come_one_owner_leaves_them_a_worker_and_all_its_work
     assert (most, ended) == (2, [None] * 8)
 
 
-async def test_outcomes_that_wait_together_wake_the_loop_once(
-    make_workers: MakeWorkers, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    workers, loop = make_workers(1), asyncio.get_running_loop()
-    woken, finished, last = 0, threading.Event(), asyncio.Event()
-    wake = loop.call_soon_threadsafe
-
-    def count(*args: Any) -> asyncio.Handle:
-        nonlocal woken
-        woken += 1
-        return wake(*args)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(loop, "call_soon_threadsafe", count)
-        for _ in range(10):
-            workers.submit("cav-1", lambda: None, lambda _: None)
-        workers.submit("cav-1", finished.set, lambda _: None)
-        workers.submit("cav-1", lambda: None, lambda _: last.set())
-        assert finished.wait(10), "the loop is held up, and the worker is not"
-        await last.wait()
-    assert woken <= 2, "one for those before, perhaps one for the last"
-
-
 async def test_close_waits_for_what_was_asked_for() -> None:
     workers, done = Workers(2, unexpected), list[int]()
     for number in range(20):

@@ -135,13 +135,6 @@ def consume(address: str, run: Run) -> None:
                     run.shown_s.append((time.time_ns() - response.picture.capture_time_ns) / 1e9)
 
 
-def free_tcp_port() -> int:
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def lives_through(run: Run, sender: Any, kills: int, frames: int) -> None:
     """Kill the sender and start it again, so often; the agent does not grow."""
     run.wait_more(frames)
@@ -158,6 +151,12 @@ def lives_through(run: Run, sender: Any, kills: int, frames: int) -> None:
     print(f"threads {threads} to {run.threads()}", end="; ")
     print(f"memory {resident_mb:.0f} to {run.resident_mb():.0f} MB; {run.latencies()}")
     assert run.resident_mb() < resident_mb + 30
+
+
+def free_tcp_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def clocks_of(run: Run) -> set[str]:
