@@ -1,4 +1,4 @@
-"""Helpers for tests that talk to a server in this process: metrics, certificates, consumers."""
+"""Helpers for tests that talk to a server: metrics, certificates, consumers, watched decoders."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -9,6 +9,8 @@ from typing import Any
 
 import grpc
 
+from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
+from mec_server.session import DecodeJob, OpenJob
 from rfcore.wire.conventions import CHANNEL_OPTIONS, CONSUMER_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
@@ -78,3 +80,31 @@ async def consumer(address: object, subscription: Subscription | None = None) ->
         call = watch_call(channel, subscription)
         await call.initial_metadata()
         yield call
+
+
+class WatchedDecoder:
+    """Calls ``before`` on the worker for each frame, then has ``decoder`` render and decode it."""
+
+    def __init__(self, decoder: Decoder, before: Callable[[DecodeJob], None]) -> None:
+        self._decoder = decoder
+        self._before = before
+
+    def reconstruct(self, job: DecodeJob) -> Reconstruction:
+        self._before(job)
+        return self._decoder.reconstruct(job)
+
+    def close(self) -> None:
+        self._decoder.close()
+
+
+def watched(before: Callable[[str, DecodeJob], None]) -> Callable[..., dict[str, Decoder]]:
+    """Return ``open_cameras`` with decoders that call ``before`` with vehicle and frame."""
+
+    def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
+        vehicle_id = job.hello.vehicle_id
+        return {
+            name: WatchedDecoder(decoder, lambda frame: before(vehicle_id, frame))
+            for name, decoder in open_cameras(job, fields, tools).items()
+        }
+
+    return opened

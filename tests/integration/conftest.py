@@ -27,7 +27,7 @@ from rfcore.codec.h264.config import CodecConfig, CoderSettings
 from rfcore.dataset import read_dataset
 from rfcore.dataset.rig import RIG_FILE, Rig, RigCamera, write_rig
 from rfcore.field import SplatField, save_field
-from rfcore.image import write_png
+from rfcore.image import Rgb, write_png
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
@@ -49,10 +49,9 @@ INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 FRAMES = 6
 
 
-def random_field(seed: int) -> SplatField:
-    """A cloud of 400 Gaussians in front of the origin."""
+def random_field(seed: int, n: int = 400) -> SplatField:
+    """A cloud of ``n`` Gaussians in front of the origin."""
     rng = np.random.default_rng(seed)
-    n = 400
     arrays = {
         "means": rng.uniform((-3, -2, 2), (3, 2, 8), (n, 3)),
         "quaternions": rng.normal(size=(n, 4)),
@@ -63,22 +62,35 @@ def random_field(seed: int) -> SplatField:
     return SplatField(Gaussians(**{name: a.astype(np.float32) for name, a in arrays.items()}))
 
 
-def write_drive(folder: Path, field: SplatField) -> None:
-    """Write pictures that look like the field, with noise and a box it has never seen."""
-    rng = np.random.default_rng(7)
+def seen_picture(field: SplatField, pose: Pose, rng: np.random.Generator) -> Rgb:
+    """Return what a noisy camera sees where the world is as the field says."""
+    colour = field.render(Camera(INTRINSICS, pose)).colour
+    return np.clip(colour * 255 + rng.normal(scale=4, size=colour.shape), 0, 255).astype(np.uint8)
+
+
+def write_pictures(folder: Path, pictures: list[tuple[Pose, Rgb]]) -> None:
+    """Write a dataset of pictures and their poses."""
     frames = []
-    for i in range(FRAMES):
-        angle = 0.02 * i
-        pose = Pose((0.1 * i, 0.0, -0.3 * i), (math.cos(angle), 0.0, math.sin(angle), 0.0))
-        colour = field.render(Camera(INTRINSICS, pose)).colour
-        rgb = np.clip(colour * 255 + rng.normal(scale=4, size=colour.shape), 0, 255)
-        rgb[20:35, 10 + 5 * i : 25 + 5 * i] = (200, 40, 30)
-        write_png(folder / f"{i:03}.png", rgb.astype(np.uint8))
+    for i, (pose, rgb) in enumerate(pictures):
+        write_png(folder / f"{i:03}.png", rgb)
         rows = zip(pose.rotation_matrix(), pose.translation_m, strict=True)
         opengl = [[r[0], -r[1], -r[2], t] for r, t in rows]
         frames.append({"file_path": f"{i:03}.png", "transform_matrix": [*opengl, [0, 0, 0, 1]]})
     top = {"w": 76, "h": 52, "fl_x": 50.0, "fl_y": 50.0, "cx": 38.0, "cy": 26.0}
     (folder / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
+
+
+def write_drive(folder: Path, field: SplatField) -> None:
+    """Write pictures that look like the field, with noise and a box it has never seen."""
+    rng = np.random.default_rng(7)
+    pictures = []
+    for i in range(FRAMES):
+        angle = 0.02 * i
+        pose = Pose((0.1 * i, 0.0, -0.3 * i), (math.cos(angle), 0.0, math.sin(angle), 0.0))
+        rgb = seen_picture(field, pose, rng)
+        rgb[20:35, 10 + 5 * i : 25 + 5 * i] = (200, 40, 30)
+        pictures.append((pose, rgb))
+    write_pictures(folder, pictures)
 
 
 def on_rig(yaw_rad: float, x_m: float = 0.0) -> Pose:
@@ -87,7 +99,7 @@ def on_rig(yaw_rad: float, x_m: float = 0.0) -> Pose:
     return Pose((x_m, 0.1, 0.0), turn.rotation).inverse()
 
 
-def write_rig_drives(folder: Path, field: SplatField, cameras: int, frames: int = FRAMES) -> Path:
+def write_rig_drives(folder: Path, field: SplatField, cameras: int) -> Path:
     """Write a rig of ``cameras`` that look at the field side by side; return its file."""
     rng = np.random.default_rng(11)
     rig = Rig(
@@ -97,22 +109,14 @@ def write_rig_drives(folder: Path, field: SplatField, cameras: int, frames: int 
         )
     )
     for camera in rig.cameras:
-        entries = []
         assert camera.drive is not None
         camera.drive.mkdir(parents=True)
-        for i in range(frames):
+        pictures = []
+        for i in range(FRAMES):
             world_from_rig = Pose((0.05 * i, 0.0, -0.2 * i), (1.0, 0.0, 0.0, 0.0))
             pose = camera_on_rig(world_from_rig, camera.camera_from_rig)
-            colour = field.render(Camera(INTRINSICS, pose)).colour
-            rgb = np.clip(colour * 255 + rng.normal(scale=4, size=colour.shape), 0, 255)
-            write_png(camera.drive / f"{i:03}.png", rgb.astype(np.uint8))
-            rows = zip(pose.rotation_matrix(), pose.translation_m, strict=True)
-            opengl = [[r[0], -r[1], -r[2], t] for r, t in rows]
-            matrix = [*opengl, [0, 0, 0, 1]]
-            entries.append({"file_path": f"{i:03}.png", "transform_matrix": matrix})
-        top = {"w": 76, "h": 52, "fl_x": 50.0, "fl_y": 50.0, "cx": 38.0, "cy": 26.0}
-        text = json.dumps({**top, "frames": entries})
-        (camera.drive / "transforms.json").write_text(text)
+            pictures.append((pose, seen_picture(field, pose, rng)))
+        write_pictures(camera.drive, pictures)
     write_rig(folder / RIG_FILE, rig)
     return folder / RIG_FILE
 

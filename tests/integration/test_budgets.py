@@ -13,17 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import grpc
-import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from structlog.testing import capture_logs
 
-from live_server import Files, certificates, counted, held, limited, until
+from integration.conftest import random_field
+from live_server import Files, certificates, counted, held, limited, until, watched
 from mec_server.config import AdmissionLimits, IdentityBudget, SessionLimits
-from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
-from mec_server.session import DecodeJob, OpenJob
-from rfcore.field import SplatField, save_field
-from rfcore.raster.gaussians import Gaussians
+from mec_server.session import DecodeJob
+from rfcore.field import save_field
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Ack, Frame, Hello, Nack
@@ -73,19 +71,9 @@ def connect(certs: Any) -> Callable[..., Any]:
 @pytest.fixture
 def large_field(tmp_path: Path) -> tuple[Path, str]:
     """A folder with a field of 3 MB: more than gRPC takes in for a peer that does not read."""
-    rng = np.random.default_rng(3)
-    n = 30_000
-    arrays = {
-        "means": rng.uniform((-3, -2, 2), (3, 2, 8), (n, 3)),
-        "quaternions": rng.normal(size=(n, 4)),
-        "log_scales": rng.uniform(-2.5, -1.0, (n, 3)),
-        "opacity_logits": rng.uniform(0, 4, n),
-        "sh": rng.normal(scale=0.8, size=(n, 4, 3)),
-    }
-    gaussians = Gaussians(**{name: a.astype(np.float32) for name, a in arrays.items()})
     folder = tmp_path / "large"
     folder.mkdir()
-    return folder, save_field(SplatField(gaussians), folder / "large.rff")
+    return folder, save_field(random_field(3, 30_000), folder / "large.rff")
 
 
 async def drives(channel: grpc.aio.Channel, coded: Any) -> None:
@@ -293,22 +281,6 @@ async def test_who_sends_what_cannot_be_decoded_is_soon_not_rendered_for(
         assert await modest.told(of_camera(coded.frames[0], "modest")) == ("ack", 0)
 
 
-class Slowed:
-    """Calls ``before`` on the worker for each frame of ``decoder``."""
-
-    def __init__(self, decoder: Decoder, vehicle_id: str, before: Callable[[str], None]) -> None:
-        self._decoder = decoder
-        self._vehicle_id = vehicle_id
-        self._before = before
-
-    def reconstruct(self, job: DecodeJob) -> Reconstruction:
-        self._before(self._vehicle_id)
-        return self._decoder.reconstruct(job)
-
-    def close(self) -> None:
-        self._decoder.close()
-
-
 async def test_a_long_render_is_charged_to_its_identity_and_leaves_a_worker_to_the_others(
     serve: Any, raw_vehicle: Any, coded: Any
 ) -> None:
@@ -316,18 +288,13 @@ async def test_a_long_render_is_charged_to_its_identity_and_leaves_a_worker_to_t
     gate = threading.Event()
     begun: list[str] = []
 
-    def slow(vehicle_id: str) -> None:
+    def slow(vehicle_id: str, _: DecodeJob) -> None:
         begun.append(vehicle_id)
         if vehicle_id == "greedy":
             assert gate.wait(30)
 
-    def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
-        vehicle_id = job.hello.vehicle_id
-        decoders = open_cameras(job, fields, tools)
-        return {name: Slowed(each, vehicle_id, slow) for name, each in decoders.items()}
-
     async with (
-        serve(opened, workers=2) as server,
+        serve(watched(slow), workers=2) as server,
         raw_vehicle(server.address) as greedy,
         raw_vehicle(server.address) as modest,
     ):
@@ -350,17 +317,12 @@ async def test_frames_of_who_sent_what_cannot_be_decoded_give_way_to_those_of_ot
 ) -> None:
     threads: list[tuple[str, str]] = []
 
-    def note(vehicle_id: str) -> None:
+    def note(vehicle_id: str, _: DecodeJob) -> None:
         threads.append((vehicle_id, threading.current_thread().name.rpartition("_")[0]))
-
-    def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
-        vehicle_id = job.hello.vehicle_id
-        decoders = open_cameras(job, fields, tools)
-        return {name: Slowed(each, vehicle_id, note) for name, each in decoders.items()}
 
     never_made_up_for = IdentityBudget(rejected_workers=1e-6)
     junk = replace(coded.frames[0].packet, render_digest=bytes(16), render_block_means=b"")
-    async with serve(opened, identity_budget=never_made_up_for) as server:
+    async with serve(watched(note), identity_budget=never_made_up_for) as server:
         async with raw_vehicle(server.address) as mallory:
             await mallory.greet(named(coded.hello, "mallory"))
             bad = replace(coded.frames[0], packet=junk.sealed())

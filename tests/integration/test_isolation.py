@@ -5,19 +5,20 @@ import threading
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import grpc
 import pytest
 from structlog.testing import capture_logs
 
-from live_server import counted, until, watch_call
+from live_server import counted, until, watch_call, watched
 from mec_server.config import AdmissionLimits, DecoderKind, LearnSettings, NatsSettings
-from mec_server.connections import ClosedConnections, Connections
 from mec_server.metrics import BackgroundTask
 from mec_server.peers import FAILED
-from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
+from mec_server.reconstruction import Decoder, FieldSource, Tools, open_cameras
 from mec_server.session import DecodeJob, OpenJob
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.wire.conventions import AGENT_PROCESS
@@ -27,34 +28,6 @@ EVERYBODY = AdmissionLimits(load=0.0)
 SAME_AGENT = ((AGENT_PROCESS, "the same"),)
 OPENINGS = "rfedge_server_openings_total"
 FAILURES = "rfedge_server_task_failures_total"
-
-
-class WatchedDecoder:
-    """Calls ``before`` on the worker for each frame, then has ``decoder`` render and decode it."""
-
-    def __init__(self, decoder: Decoder, before: Callable[[DecodeJob], None]) -> None:
-        self._decoder = decoder
-        self._before = before
-
-    def reconstruct(self, job: DecodeJob) -> Reconstruction:
-        self._before(job)
-        return self._decoder.reconstruct(job)
-
-    def close(self) -> None:
-        self._decoder.close()
-
-
-def watched(before: Callable[[str, DecodeJob], None]) -> Callable[..., dict[str, Decoder]]:
-    """Return ``open_cameras`` with decoders that call ``before`` with vehicle and frame."""
-
-    def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
-        vehicle_id = job.hello.vehicle_id
-        return {
-            name: WatchedDecoder(decoder, lambda frame: before(vehicle_id, frame))
-            for name, decoder in open_cameras(job, fields, tools).items()
-        }
-
-    return opened
 
 
 def with_cameras(hello: Hello, vehicle_id: str, camera_ids: list[str]) -> Hello:
@@ -214,51 +187,47 @@ def failed(server: Any, task: BackgroundTask) -> bool:
     return counted(server, FAILURES, task=task) >= 1
 
 
-async def publications_fail(scene: Scene) -> Any:
-    scene.patch.setattr("mec_server.server.PUBLICATIONS_EVERY_S", 0.001)
-    async with scene.serve() as server:
-        refresh, looked = server._published.refresh, asyncio.Event()
-        scene.patch.setattr(server._published, "refresh", surprise)
-        await until(lambda: failed(server, BackgroundTask.PUBLICATIONS))
-        loop = asyncio.get_running_loop()
-
-        def good_again() -> bool:
-            loop.call_soon_threadsafe(looked.set)
-            return bool(refresh())
-
-        scene.patch.setattr(server._published, "refresh", good_again)
-        async with asyncio.timeout(30):
-            await looked.wait()
-    return server
+REPEATED = {
+    BackgroundTask.PUBLICATIONS: (
+        "fields.index.PublishedFields.refresh",
+        "PUBLICATIONS_EVERY_S",
+    ),
+    BackgroundTask.ACCESS: ("guard.Guard.sweep", "SWEEP_EVERY_S"),
+    BackgroundTask.FIELDS: ("fields.index.FieldIndex.refresh", "FIELDS_EVERY_S"),
+    BackgroundTask.CONNECTIONS: ("connections.Connections.sweep", "CONNECTIONS_EVERY_S"),
+    BackgroundTask.LEARNING: ("learner.Learner.look", "LEARNING_EVERY_S"),
+    BackgroundTask.NOTICES: ("twin.notices.StreetNotices.follow", "NOTICES_EVERY_S"),
+    BackgroundTask.NATS_TWIN: ("twin.nats.TwinPublisher.run", ""),
+    BackgroundTask.NATS_FIELDS: ("nats.FieldExchange.run", ""),
+}
+"""What each task that is repeated does, and the constant that says how often."""
 
 
-async def fields_fail(scene: Scene) -> Any:
-    async with scene.serve() as server:
-        scene.patch.setattr(server._index, "refresh", surprise)
-        await until(lambda: failed(server, BackgroundTask.FIELDS))
+async def repeated_task_fails(task: BackgroundTask, scene: Scene) -> Any:
+    """Have what a task does fail until a vehicle was served; expect that it is done again."""
+    name, period = REPEATED[task]
+    done = resolve_name(f"mec_server.{name}")
+    well, again = threading.Event(), threading.Event()
+
+    def fail_at_first(*args: Any) -> Any:
+        if not well.is_set():
+            raise SurpriseError
+        again.set()
+        return done(*args)
+
+    scene.patch.setattr(f"mec_server.{name}", fail_at_first)
+    pause = f"mec_server.server.{period}" if period else "mec_server.twin.nats.AGAIN_S"
+    scene.patch.setattr(pause, 0.001)
+    options: dict[str, Any] = {}
+    if task is BackgroundTask.LEARNING:
+        options = {"record": scene.folder, "learn": LearnSettings(on=True)}
+    elif not period:  # nobody listens at the port, so that the other part waits
+        options = {"nats": NatsSettings("nats://127.0.0.1:1")}
+    async with scene.serve(**options) as server:
+        await until(lambda: failed(server, task))
         await drive_on(scene, server)
-        looked = threading.Event()
-        scene.patch.setattr(server._index, "refresh", looked.set)
-        await asyncio.to_thread(looked.wait, 30)
-        assert looked.is_set()
-    return server
-
-
-async def connections_fail(scene: Scene) -> Any:
-    sweep, looked = "mec_server.connections.Connections.sweep", threading.Event()
-
-    def seen(_: Connections, now: float) -> list[ClosedConnections]:
-        del now
-        looked.set()
-        return []
-
-    async with scene.serve() as server:
-        scene.patch.setattr(sweep, surprise)
-        await until(lambda: failed(server, BackgroundTask.CONNECTIONS))
-        await drive_on(scene, server)
-        scene.patch.setattr(sweep, seen)
-        await asyncio.to_thread(looked.wait, 30)
-        assert looked.is_set()
+        well.set()
+        await until(again.is_set)
     return server
 
 
@@ -341,25 +310,6 @@ async def recording_fails(scene: Scene) -> Any:
     return server
 
 
-async def learning_fails(scene: Scene) -> Any:
-    scene.patch.setattr("mec_server.server.LEARNING_EVERY_S", 0.001)
-    scene.patch.setattr("mec_server.server.Learner.look", surprise)
-    learn = LearnSettings(on=True)
-    async with scene.serve(record=scene.folder, learn=learn) as server:
-        await until(lambda: failed(server, BackgroundTask.LEARNING))
-        await drive_on(scene, server)
-    return server
-
-
-async def notices_fail(scene: Scene) -> Any:
-    scene.patch.setattr("mec_server.server.NOTICES_EVERY_S", 0.001)
-    scene.patch.setattr("mec_server.server.StreetNotices.follow", surprise)
-    async with scene.serve() as server:
-        await until(lambda: failed(server, BackgroundTask.NOTICES))
-        await drive_on(scene, server)
-    return server
-
-
 async def drive_on(scene: Scene, server: Any) -> None:
     """Expect that a vehicle is served."""
     async with scene.raw_vehicle(server.address) as vehicle:
@@ -368,47 +318,7 @@ async def drive_on(scene: Scene, server: Any) -> None:
         assert await vehicle.farewell() is grpc.StatusCode.OK
 
 
-async def access_fails(scene: Scene) -> Any:
-    scene.patch.setattr("mec_server.server.SWEEP_EVERY_S", 0.001)
-    async with scene.serve() as server:
-        sweep, swept = server._guard.sweep, asyncio.Event()
-        scene.patch.setattr(server._guard, "sweep", surprise)
-        await until(lambda: failed(server, BackgroundTask.ACCESS))
-
-        def good_again() -> None:
-            swept.set()
-            sweep()
-
-        scene.patch.setattr(server._guard, "sweep", good_again)
-        async with asyncio.timeout(30):
-            await swept.wait()
-        return server
-
-
-async def nats_twin_fails(scene: Scene) -> Any:
-    return await _nats_fails(scene, "mec_server.twin.nats.TwinPublisher", BackgroundTask.NATS_TWIN)
-
-
-async def nats_fields_fail(scene: Scene) -> Any:
-    return await _nats_fails(scene, "mec_server.nats.FieldExchange", BackgroundTask.NATS_FIELDS)
-
-
-async def _nats_fails(scene: Scene, part: str, task: BackgroundTask) -> Any:
-    """Have a part fail at first; nobody listens at the port, so that the other one waits."""
-    scene.patch.setattr("mec_server.twin.nats.AGAIN_S", 0.001)
-    scene.patch.setattr(f"{part}.run", surprise)
-    nats = NatsSettings("nats://127.0.0.1:1")
-    async with scene.serve(nats=nats) as server:
-        await until(lambda: failed(server, task))
-        await drive_on(scene, server)
-    return server
-
-
 SABOTAGE: dict[BackgroundTask, Callable[[Scene], Awaitable[Any]]] = {
-    BackgroundTask.PUBLICATIONS: publications_fail,
-    BackgroundTask.ACCESS: access_fails,
-    BackgroundTask.FIELDS: fields_fail,
-    BackgroundTask.CONNECTIONS: connections_fail,
     BackgroundTask.OPENING: opening_fails,
     BackgroundTask.OUTCOME: outcome_fails,
     BackgroundTask.CLOSING: closing_fails,
@@ -416,11 +326,7 @@ SABOTAGE: dict[BackgroundTask, Callable[[Scene], Awaitable[Any]]] = {
     BackgroundTask.STREAM: stream_fails,
     BackgroundTask.CONSUMER: consumer_fails,
     BackgroundTask.RECORDING: recording_fails,
-    BackgroundTask.LEARNING: learning_fails,
-    BackgroundTask.NOTICES: notices_fail,
-    BackgroundTask.NATS_TWIN: nats_twin_fails,
-    BackgroundTask.NATS_FIELDS: nats_fields_fail,
-}
+} | {task: partial(repeated_task_fails, task) for task in REPEATED}
 ENDS_WITH_IT = {BackgroundTask.OPENING: BackgroundTask.STREAM}
 """A task that ends through the failure of another is counted, too."""
 

@@ -11,22 +11,15 @@ import pytest
 from structlog.testing import capture_logs
 
 from cav_agent.config import PaceKind
-from mec_server.reconstruction import (
-    Decoder,
-    FieldSource,
-    OpenCameras,
-    Reconstruction,
-    Tools,
-    open_cameras,
-)
-from mec_server.session import DecodeJob, OpenJob
+from integration.conftest import FRAMES, Street, write_rig_drives
+from live_server import watched
+from mec_server.session import DecodeJob
 from mec_server.twin.state import ReceivedPicture, Twin
 from rfcore.camera import Pose, camera_on_rig
 from rfcore.dataset.rig import read_rig, read_rig_drive
 from rfcore.errors import PacketRejected, RejectReason
 from rfcore.image import Rgb
 from rfcore.views import View
-from tests.integration.conftest import FRAMES, Street, write_rig_drives
 
 CAMERA = "[camera]\nwidth_px = 76\nheight_px = 52\nfx_px = 50.0\ncx_px = 38.0\ncy_px = 26.0\n"
 
@@ -50,28 +43,10 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[ReceivedPicture]:
     return views
 
 
-class FailingDecoder:
-    """Refuses every frame."""
-
-    def __init__(self, decoder: Decoder) -> None:
-        self._decoder = decoder
-
-    def reconstruct(self, job: DecodeJob) -> Reconstruction:  # noqa: ARG002
+def refuse(_: str, job: DecodeJob) -> None:
+    """Refuse the frames of one camera."""
+    if job.frame.camera_id == "cam2":
         raise PacketRejected(RejectReason.DECODER_FAILED, "it is broken")
-
-    def close(self) -> None:
-        self._decoder.close()
-
-
-def failing_camera(camera_id: str) -> OpenCameras:
-    """Return what opens decoders of which that of one camera always fails."""
-
-    def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
-        decoders = open_cameras(job, fields, tools)
-        decoders[camera_id] = FailingDecoder(decoders[camera_id])
-        return decoders
-
-    return opened
 
 
 async def test_four_cameras_are_one_session_with_one_pose_an_instant(
@@ -120,7 +95,7 @@ async def test_a_camera_whose_decoder_fails_takes_no_other_with_it(
     serve: Any, vehicle: Any, rig: Path
 ) -> None:
     async with (
-        serve(failing_camera("cam2")) as server,
+        serve(watched(refuse)) as server,
         vehicle(server.address, drive=None, rig=rig) as driving,
     ):
         counts = await driving.end()
