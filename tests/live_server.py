@@ -1,6 +1,7 @@
 """Helpers for tests that talk to a server: metrics, certificates, consumers, watched decoders."""
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
@@ -50,6 +51,26 @@ def certificates(root: Path, members: Members, age_days: int = 0) -> Files:
     now = datetime.now(UTC) - timedelta(days=age_days)
     write_certificates(root, certify(members, now, days=30))
     return lambda name: TlsFiles(root / f"{name}.pem", root / f"{name}.key", root / "ca.pem")
+
+
+def tls_options(root: Path, name: str, authority: Path | None = None) -> tuple[str, ...]:
+    """Return the options of a service or a vehicle with a certificate of ``root``."""
+    files = {"cert": root / f"{name}.pem", "key": root / f"{name}.key"}
+    files["ca"] = authority or root / "ca.pem"
+    return tuple(str(part) for end, file in files.items() for part in (f"--tls-{end}", file))
+
+
+async def port_opens(address: str) -> float:
+    """Return the second of the Unix epoch at which a connection to the address succeeds."""
+    host, _, port = address.rpartition(":")
+    while True:
+        try:
+            _, writer = await asyncio.open_connection(host, int(port))
+        except OSError:
+            await asyncio.sleep(0.005)
+        else:
+            writer.close()
+            return time.time()
 
 
 def channel_to(address: object, tls: TlsFiles) -> grpc.aio.Channel:

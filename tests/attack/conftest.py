@@ -34,6 +34,7 @@ from attack.attacker import DEFERRED, LOG_LINES, OPEN_FILES, PROCESSOR_S
 from attack.bystander import NAME, NEWCOMER
 from attack.control_group import SERVER, ControlGroup
 from attack.target import VEHICLE, Target
+from live_server import tls_options
 from machine import MEASURED_AGAIN
 from rfedge.certs import Members, certify, write_certificates
 from scoreboard import Figures, Scoreboard
@@ -357,11 +358,6 @@ def metrics_address(log: Path) -> str:
     return f"127.0.0.1:{port}"
 
 
-def tls(root: Path, name: str) -> list[str]:
-    files = {"--tls-cert": f"{name}.pem", "--tls-key": f"{name}.key", "--tls-ca": "ca.pem"}
-    return [str(part) for option, file in files.items() for part in (option, root / file)]
-
-
 @pytest.fixture(scope="session")
 def coded_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of the sample's drive, coded against the field that ships."""
@@ -411,7 +407,7 @@ async def scene(
             *("--ready-file", tmp_path / "ready", "--metrics-port", 0, "--log", "json"),
             *("--decoder", "landlock", "--sandbox-as-root", MAX_FIELD),
             *("--access", access),
-            *tls(certificates, "server"),
+            *tls_options(certificates, "server"),
             limited=True,
         )
         decoy = start("decoy", *ATTACKER, "--decoy", tmp_path / "decoy", certificates)

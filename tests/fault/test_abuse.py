@@ -23,7 +23,8 @@ from attack.conftest import ENVIRONMENT
 from attack.control_group import ControlGroup
 from attack.target import Target
 from fault.conftest import FAULT_S
-from fault.test_packets import PACE_S, nacked, numbered
+from fault.test_packets import nacked, paced
+from live_server import tls_options
 from mec_server.config import IdentityBudget
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import LONGER_BURST_S
@@ -41,14 +42,10 @@ async def test_renders_that_differ(streaming: Any, case: Any, coded: Any, raw_ve
     async with raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)
         await case.calm()
-        until_s = time.monotonic() + FAULT_S
-        for frame in numbered(coded.frames):
+        async for frame in paced(coded.frames):
             packet = replace(frame.packet, render_digest=bytes(16)).sealed()
             told["wrong", (await vehicle.told(replace(frame, packet=packet)))[0]] += 1
             told["right", (await vehicle.told(frame))[0]] += 1
-            await asyncio.sleep(PACE_S)
-            if time.monotonic() > until_s:
-                break
         case.over()
     wanted = {("wrong", "render_mismatch"), ("right", "ack")}
     case.holds("refused as render_mismatch, the next frame taken", set(told) == wanted)
@@ -74,15 +71,12 @@ async def test_renders_for_nothing(site: Any, case: Any, coded: Any, raw_vehicle
         await case.calm()
         spent_s = -rejected_s(server)
         began_s = time.monotonic()
-        for frame in numbered(coded.frames):
-            await asyncio.sleep(PACE_S)
+        async for frame in paced(coded.frames, case.lasting(FAULT_S)):
             packet = replace(frame.packet, render_digest=bytes(16)).sealed()
             try:
                 told[(await vehicle.told(replace(frame, packet=packet)))[0]] += 1
             except (grpc.aio.AioRpcError, asyncio.InvalidStateError):
                 ended = await vehicle.stream.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-                break
-            if time.monotonic() > began_s + case.lasting(FAULT_S):
                 break
         await asyncio.sleep(max(0.0, began_s + case.lasting(FAULT_S) - time.monotonic()))
         lasted_s = time.monotonic() - began_s
@@ -209,12 +203,9 @@ async def test_an_abusive_peer(
     members = Members(("attacker", "bystander"), ("attacker",))
     write_certificates(root, certify(members, datetime.now(UTC), days=2))
 
-    def tls(name: str) -> tuple[str, ...]:
-        files = {"--tls-cert": f"{name}.pem", "--tls-key": f"{name}.key", "--tls-ca": "ca.pem"}
-        return tuple(str(x) for option, file in files.items() for x in (option, root / file))
-
-    server = await site.server(*tls("server"))
-    bystander = await site.vehicle(server.address, "bystander", *tls("vehicle-bystander"))
+    server = await site.server(*tls_options(root, "server"))
+    own = tls_options(root, "vehicle-bystander")
+    bystander = await site.vehicle(server.address, "bystander", *own)
     metrics = f"127.0.0.1:{server.entries('metrics')[-1]['port']}"
     fields = str(street.store)
     target = Target(

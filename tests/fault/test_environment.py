@@ -8,12 +8,14 @@ from collections import Counter
 from contextlib import AsyncExitStack
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import grpc
 import pytest
 
+from live_server import tls_options
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.twin import PictureEncoding, Subscription, subscription_to_wire
@@ -132,10 +134,7 @@ async def test_an_expired_certificate(site: Any, case: Any, tmp_path: Path) -> N
     both.write_bytes(b"".join((tmp_path / f / "ca.pem").read_bytes() for f in ("old", "new")))
 
     def tls(folder: str, name: str) -> tuple[str, ...]:
-        root = tmp_path / folder
-        files = (root / f"{name}.pem", root / f"{name}.key", both)
-        names = ("--tls-cert", "--tls-key", "--tls-ca")
-        return tuple(str(x) for pair in zip(names, files, strict=True) for x in pair)
+        return tls_options(tmp_path / folder, name, both)
 
     server = await site.server(*tls("new", "server"))
     bystander = await site.vehicle(server.address, "bystander", *tls("new", "vehicle-bystander"))
@@ -164,10 +163,7 @@ async def test_a_revoked_certificate(site: Any, case: Any, appears: Any, tmp_pat
     write_certificates(root, certify(members, datetime.now(UTC), days=2))
     access.write_text("")
 
-    def tls(name: str) -> tuple[str, ...]:
-        files = {"--tls-cert": f"{name}.pem", "--tls-key": f"{name}.key", "--tls-ca": "ca.pem"}
-        return tuple(str(x) for option, file in files.items() for x in (option, root / file))
-
+    tls = partial(tls_options, root)
     server = await site.server(*tls("server"), "--access", str(access))
     bystander = await site.vehicle(server.address, "bystander", *tls("vehicle-bystander"))
     victim = await site.vehicle(server.address, "cav-1", *tls("vehicle-cav-1"))

@@ -1,101 +1,61 @@
 """Links that go silent, and links that collapse."""
 
 import asyncio
-import itertools
-import os
-import shutil
 import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-NUMBERS = itertools.count()
+from namespaces import Wire, connected, require, run, within
+
 SILENT_S = 10.0
 CALM_S = 3.0
 
 
-@dataclass(frozen=True)
-class Wire:
-    """Two network namespaces and what lies between them."""
+def cut(wire: Wire) -> float:
+    """Let nothing through any more, and nobody know; return when."""
+    far = within(wire.far)
+    run(*far, "nft", "add", "table", "inet", "cut")
+    for hook, device in (("input", "iifname"), ("output", "oifname")):
+        run(*far, "nft", f"add chain inet cut {hook} {{ type filter hook {hook} priority 0 ; }}")
+        run(*far, "nft", f'add rule inet cut {hook} {device} "rffar" drop')
+    return time.time()
 
-    near: str
-    far: str
-    far_address: str = "10.214.0.2"
 
-    def within(self, name: str) -> tuple[str, ...]:
-        """Return what runs a command in a namespace."""
-        return ("ip", "netns", "exec", name)
-
-    def cut(self) -> float:
-        """Let nothing through any more, and nobody know; return when."""
-        table = ["nft", "add", "table", "inet", "cut"]
-        subprocess.run([*self.within(self.far), *table], check=True)
-        for hook, device in (("input", "iifname"), ("output", "oifname")):
-            chain = f"add chain inet cut {hook} {{ type filter hook {hook} priority 0 ; }}"
-            rule = f'add rule inet cut {hook} {device} "rffar" drop'
-            for command in (chain, rule):
-                subprocess.run([*self.within(self.far), "nft", command], check=True)
-        return time.time()
-
-    def heal(self) -> float:
-        """Let everything through again; return when."""
-        delete = ["nft", "delete", "table", "inet", "cut"]
-        subprocess.run([*self.within(self.far), *delete], check=True)
-        return time.time()
+def heal(wire: Wire) -> float:
+    """Let everything through again; return when."""
+    run(*within(wire.far), "nft", "delete", "table", "inet", "cut")
+    return time.time()
 
 
 @pytest.fixture
-def wire(as_root: None) -> Iterator[Wire]:  # noqa: ARG001
-    for name in ("ip", "nft"):
-        if shutil.which(name) is None:
-            pytest.fail(f"{name} is missing: run `make test-system-packages`")
-    number = f"{os.getpid()}-{next(NUMBERS)}"
-    ends = Wire(f"rfcn{number}", f"rfcf{number}")
-
-    def ip(command: str) -> None:
-        subprocess.run(["ip", *command.split()], check=True)
-
-    for name in (ends.near, ends.far):
-        ip(f"netns add {name}")
-    try:
-        ip(f"-n {ends.near} link add rfnear type veth peer name rffar netns {ends.far}")
-        for name, device, address in (
-            (ends.near, "rfnear", "10.214.0.1"),
-            (ends.far, "rffar", ends.far_address),
-        ):
-            ip(f"-n {name} addr add {address}/24 dev {device}")
-            ip(f"-n {name} link set {device} up")
-            ip(f"-n {name} link set lo up")
+def wire() -> Iterator[Wire]:
+    require("ip", "nft")
+    with connected() as ends:
         yield ends
-    finally:
-        for name in (ends.near, ends.far):
-            ip(f"netns del {name}")
 
 
 async def test_a_silent_partition(wire: Wire, site: Any, case: Any, appears: Any) -> None:
     case.about("silent partition of 10 s", "nft drop between network namespaces, both ways", "F4")
     reachable = ("--allow-insecure", "--decoder", "in-process")
-    server = await site.server(
-        *reachable, listen=f"{wire.far_address}:0", within=wire.within(wire.far)
-    )
+    server = await site.server(*reachable, listen=f"{wire.far_address}:0", within=within(wire.far))
     bystander = await site.vehicle(
-        server.address, "bystander", "--allow-insecure", within=wire.within(wire.far)
+        server.address, "bystander", "--allow-insecure", within=within(wire.far)
     )
     victim = await site.vehicle(
-        server.address, "cav-1", "--allow-insecure", within=wire.within(wire.near)
+        server.address, "cav-1", "--allow-insecure", within=within(wire.near)
     )
     await case.calm()
-    cut_s = wire.cut()
+    cut_s = cut(wire)
     await appears(lambda: victim.entries("stream lost"))
     case.at_most("noticed", time.time() - cut_s, 1.5)
     await asyncio.sleep(max(0.0, cut_s + SILENT_S - time.time()))
-    healed_s = wire.heal()
+    healed_s = heal(wire)
     await appears(lambda: len(victim.acked(healed_s)) >= 6)
     case.over()
     case.at_most("stream back after healing", victim.acked_at_s(healed_s)[0] - healed_s, 2)
@@ -109,16 +69,16 @@ async def test_a_silent_partition(wire: Wire, site: Any, case: Any, appears: Any
 async def test_a_link_that_flaps(wire: Wire, site: Any, case: Any, appears: Any) -> None:
     case.about("link down for 1 s, every 3 s", "ip link set down and up, three times", "F5")
     reachable = ("--allow-insecure", "--decoder", "in-process")
-    far, near = wire.within(wire.far), wire.within(wire.near)
+    far, near = within(wire.far), within(wire.near)
     server = await site.server(*reachable, listen=f"{wire.far_address}:0", within=far)
     bystander = await site.vehicle(server.address, "bystander", "--allow-insecure", within=far)
     victim = await site.vehicle(server.address, "cav-1", "--allow-insecure", within=near)
     await case.calm()
     back_s = []
     for _ in range(3):
-        subprocess.run([*near, "ip", "link", "set", "rfnear", "down"], check=True)
+        run(*near, "ip", "link", "set", "rfnear", "down")
         await asyncio.sleep(1.0)
-        subprocess.run([*near, "ip", "link", "set", "rfnear", "up"], check=True)
+        run(*near, "ip", "link", "set", "rfnear", "up")
         up_s = time.time()
         await appears(lambda since=up_s: victim.acked(since))
         back_s.append(victim.acked_at_s(up_s)[0] - up_s)

@@ -8,7 +8,6 @@ max(3 d, d + 150 ms), d their mean distance (W3C webrtc-stats, ``freezeCount``).
 """
 
 import asyncio
-import os
 import subprocess
 import sys
 import time
@@ -25,6 +24,7 @@ import pytest
 from attack.conftest import ENVIRONMENT, ROOT
 from fault.conftest import is_exact
 from lab.pages.suites import LinkCell
+from namespaces import namespace, within
 from rfcore.dataset import read_dataset
 from rfcore.dataset.recorded_session import read_recorded_part, recordings_under
 from rfcore.field import FieldStore
@@ -38,16 +38,6 @@ OLDEST_S = 5.0
 """``AgentLimits.answer_s``: a stream whose frames take longer is given up."""
 DRIVE = ROOT / "samples/street/transforms_drive_vehicles.json"
 PICTURES = 12
-
-
-@contextmanager
-def namespace(name: str) -> Iterator[str]:
-    subprocess.run(["ip", "netns", "add", name], check=True)
-    try:
-        subprocess.run(["ip", "-n", name, "link", "set", "lo", "up"], check=True)
-        yield name
-    finally:
-        subprocess.run(["ip", "netns", "del", name], check=True)
 
 
 @contextmanager
@@ -135,19 +125,18 @@ async def test_a_lossy_link(
     field_id = FieldStore(tmp_path / "fields").add(ROOT / "samples/fields/street.rff")
     fields = ("--fields", str(tmp_path / "fields"))
     with ExitStack() as stack:
-        far = stack.enter_context(namespace(f"rff{os.getpid()}"))
-        near = stack.enter_context(namespace(f"rfn{os.getpid()}"))
+        far = stack.enter_context(namespace("far"))
+        near = stack.enter_context(namespace("near"))
         numbers = (loss_percent, rtt_ms, rate_mbps)
         stack.enter_context(lossy_wire(near, far, "10.215.0", *numbers))
-        within = ("ip", "netns", "exec", far)
-        server = await site.server(*options, *fields, listen="0.0.0.0:0", within=within)
+        server = await site.server(*options, *fields, listen="0.0.0.0:0", within=within(far))
         agent = await site.vehicle(
             f"10.215.0.2:{server.address.rpartition(':')[2]}",
             "cav",
             *("--drive", str(DRIVE), *fields, "--field", field_id),
             *("--rate", str(HZ), "--max-delay-ms", "1000", "--allow-insecure"),
             "--allow-recording",
-            within=("ip", "netns", "exec", near),
+            within=within(near),
         )
         await asyncio.sleep(SETTLE_S)
         began_s = time.time()

@@ -43,6 +43,16 @@ def numbered(frames: list[Frame]) -> Iterator[Frame]:
         yield replace(frame, packet=packet)
 
 
+async def paced(frames: list[Frame], seconds: float = FAULT_S) -> AsyncIterator[Frame]:
+    """Yield frames as ``numbered``, ``PACE_S`` apart, for that long."""
+    until_s = time.monotonic() + seconds
+    for frame in numbered(frames):
+        if time.monotonic() > until_s:
+            return
+        await asyncio.sleep(PACE_S)
+        yield frame
+
+
 def flipped(data: bytes, rng: random.Random) -> bytes:
     """Flip one bit: in the payload, in the CRC, or in a number that no CRC covers."""
     where = rng.randrange(len(data) // 2, len(data))
@@ -112,12 +122,8 @@ async def test_replayed_packets(streaming: Any, case: Any, coded: Any, raw_vehic
     async with raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)
         assert await vehicle.told(coded.frames[0]) == ("ack", 0)
-        frames = numbered(coded.frames)
         await case.calm()
-        until_s = time.monotonic() + FAULT_S
-        while time.monotonic() < until_s:
-            frame = next(frames)
-            await asyncio.sleep(PACE_S)
+        async for frame in paced(coded.frames):
             told["new", (await vehicle.told(frame))[0]] += 1
             told["again", (await vehicle.told(frame))[0]] += 1
             told["old", (await vehicle.told(coded.frames[1]))[0]] += 1
@@ -175,16 +181,12 @@ async def test_a_wrong_field_version(
         case.holds("NOT_FOUND", await vehicle.end() is grpc.StatusCode.NOT_FOUND)
     async with raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)
-        until_s = time.monotonic() + FAULT_S
         refused = taken = 0
-        for frame in numbered(coded.frames):
+        async for frame in paced(coded.frames):
             other = replace(frame, field_id_prefix=bytes.fromhex(street.other_id)[:8])
             answer = await vehicle.told(other)
             refused += answer[0] == "invalid_argument"
             taken += (await vehicle.told(frame))[0] == "ack"
-            await asyncio.sleep(PACE_S)
-            if time.monotonic() > until_s:
-                break
         case.over()
     case.holds("no frame mixed", refused == taken > 0)
     case.holds("metric counts them", nacked(server, "invalid_argument") == refused)
@@ -207,8 +209,7 @@ async def test_poses_that_are_not_numbers(
     async with raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)
         await case.calm()
-        until_s = time.monotonic() + FAULT_S
-        for frame in numbered(coded.frames):
+        async for frame in paced(coded.frames):
             message = pb.StreamRequest()
             message.ParseFromString(client_message_to_bytes(frame))
             for name, number in zip(
@@ -222,9 +223,6 @@ async def test_poses_that_are_not_numbers(
             answer = await vehicle.ask(message.SerializeToString())
             refused += isinstance(answer, Nack) and str(answer.reason) == "invalid_argument"
             taken += (await vehicle.told(frame))[0] == "ack"
-            await asyncio.sleep(PACE_S)
-            if time.monotonic() > until_s:
-                break
         case.over()
     case.holds("each refused by the name of the field, the next frame taken", refused == taken > 0)
     case.holds("metric counts them", nacked(server, "invalid_argument") == refused)
@@ -280,16 +278,12 @@ async def test_a_resolution_bomb(streaming: Any, case: Any, coded: Any, raw_vehi
         nack = await vehicle.ask(bad)
         case.holds("Hello refused by stream_header.sps", "stream_header.sps" in str(nack.problem))
         await vehicle.greet(coded.hello)
-        until_s = time.monotonic() + FAULT_S
         told: Counter[str] = Counter()
-        for frame in numbered(coded.frames):
+        async for frame in paced(coded.frames):
             payload = large.sps + b"\x00\x00\x00\x01" + frame.packet.payload
             packet = replace(frame.packet, payload=payload).sealed()
             told[(await vehicle.told(replace(frame, packet=packet)))[0]] += 1
             told[(await vehicle.told(frame))[0]] += 1
-            await asyncio.sleep(PACE_S)
-            if time.monotonic() > until_s:
-                break
         case.over()
     case.holds("payloads refused before the decoder", told["malformed_payload"] == told["ack"] > 0)
     case.holds("metric counts them", nacked(server, "malformed_payload") == told["ack"])
@@ -309,17 +303,13 @@ async def test_a_clock_that_is_wrong(
     async with raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)
         await case.calm()
-        until_s = time.monotonic() + FAULT_S
         exact = True
-        for frame in numbered(coded.frames):
+        async for frame in paced(coded.frames):
             skewed_ns = time.time_ns() + skew_s * 10**9
             answer = await vehicle.ask(replace(frame, capture_time_ns=skewed_ns))
             assert isinstance(answer, Ack)
             exact = exact and answer.reconstruction_digest == frame.packet.reconstruction_digest
             taken += 1
-            await asyncio.sleep(PACE_S)
-            if time.monotonic() > until_s:
-                break
         age_s = server.value("rfedge_twin_age_seconds")
         case.over()
         case.holds("every frame taken, exact", exact and taken > 0)

@@ -9,20 +9,8 @@ from typing import Any
 import pytest
 
 from fault.conftest import FAULT_S
+from live_server import port_opens
 from rfcore.wire.messages import Ack, Nack
-
-
-async def port_opens(address: str) -> float:
-    """Return the second at which a connection to the address succeeds."""
-    host, _, port = address.rpartition(":")
-    while True:
-        try:
-            _, writer = await asyncio.open_connection(host, int(port))
-        except OSError:
-            await asyncio.sleep(0.005)
-        else:
-            writer.close()
-            return time.time()
 
 
 @pytest.mark.fault_core

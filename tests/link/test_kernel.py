@@ -7,23 +7,20 @@ the machine, an exact serialiser, does not.
 
 import asyncio
 import ctypes
-import itertools
 import json
 import math
 import os
-import shutil
 import socket
 import struct
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 import pytest
 
+from namespaces import Wire, connected, require, run, within
 from rfcore.link import Arrival, LinkProfile, delivery_times
 from rfedge.link.proxy import LinkProxy, ProxySettings
 
@@ -34,18 +31,11 @@ BURST_BYTES = 1600
 OVERHEAD_BYTES = 14 + 20 + 8
 CLONE_NEWNET = 0x40000000
 SO_TIMESTAMPNS = 35
-NUMBERS = itertools.count()
 LIBC = ctypes.CDLL(None, use_errno=True)
 Result = TypeVar("Result")
 
 
-def run(command: str) -> str:
-    done = subprocess.run(command.split(), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{command}: {done.stderr}"
-    return done.stdout
-
-
-def within(namespace: str, make: Callable[[], Result]) -> Result:
+def made_within(namespace: str, make: Callable[[], Result]) -> Result:
     """Call ``make`` on a thread that lives in ``namespace``; sockets made there stay there."""
     made: list[Result | BaseException] = []
 
@@ -68,48 +58,20 @@ def within(namespace: str, make: Callable[[], Result]) -> Result:
     return made[0]
 
 
-@dataclass(frozen=True)
-class Wire:
-    """Two namespaces and the addresses of the ends; from ``near`` on it is shaped."""
-
-    near: str
-    far: str
-    near_address: str = "10.213.0.1"
-    far_address: str = "10.213.0.2"
-
-    def sent_bytes(self) -> int:
-        """What left the near end so far, as the kernel counts it."""
-        shown = run(f"ip netns exec {self.near} tc -s -j qdisc show dev rfnear")
-        return int(next(q for q in json.loads(shown) if q["kind"] == "tbf")["bytes"])
+def sent_bytes(wire: Wire) -> int:
+    """Return what left the near end so far, as the kernel counts it."""
+    shown = run(*within(wire.near), *["tc", "-s", "-j", "qdisc", "show", "dev", "rfnear"])
+    return int(next(q for q in json.loads(shown) if q["kind"] == "tbf")["bytes"])
 
 
 @pytest.fixture
 def wire() -> Iterator[Wire]:
-    if os.geteuid() != 0:
-        pytest.skip("network namespaces need root")
-    for name in ("ip", "tc"):
-        if shutil.which(name) is None:
-            pytest.fail(f"{name} is missing: run `make test-system-packages`")
-    number = f"{os.getpid()}-{next(NUMBERS)}"
-    ends = Wire(f"rfn{number}", f"rff{number}")
-    for name in (ends.near, ends.far):
-        run(f"ip netns add {name}")
-    try:
-        run(f"ip -n {ends.near} link add rfnear type veth peer name rffar netns {ends.far}")
-        for name, device, address in (
-            (ends.near, "rfnear", ends.near_address),
-            (ends.far, "rffar", ends.far_address),
-        ):
-            run(f"ip -n {name} addr add {address}/24 dev {device}")
-            run(f"ip -n {name} link set {device} up")
-        run(
-            f"ip netns exec {ends.near} tc qdisc add dev rfnear root tbf "
-            f"rate {RATE_BPS:.0f}bit burst {BURST_BYTES} limit 10000000"
-        )
+    """Two namespaces; from the near one on the wire is shaped."""
+    require("ip", "tc")
+    with connected() as ends:
+        bucket = f"rate {RATE_BPS:.0f}bit burst {BURST_BYTES} limit 10000000"
+        run(*within(ends.near), *f"tc qdisc add dev rfnear root tbf {bucket}".split())
         yield ends
-    finally:
-        for name in (ends.near, ends.far):
-            run(f"ip netns del {name}")
 
 
 def udp(address: str) -> socket.socket:
@@ -152,8 +114,8 @@ def test_datagrams_leave_the_kernels_bucket_when_the_machine_says(wire: Wire) ->
 
 def _send_bursts(wire: Wire, count: int, every_s: float) -> tuple[list[float], list[Arrival]]:
     """Send ``count`` bursts of 40 datagrams; return when each was heard, and what was sent when."""
-    near = within(wire.near, lambda: udp(wire.near_address))
-    far = within(wire.far, lambda: udp(wire.far_address))
+    near = made_within(wire.near, lambda: udp(wire.near_address))
+    far = made_within(wire.far, lambda: udp(wire.far_address))
     near.connect(far.getsockname())
     heard_s: list[float] = []
 
@@ -180,9 +142,9 @@ async def test_the_proxy_takes_as_long_as_the_kernel_for_the_same_bytes(wire: Wi
     size_bytes = 200_000
     kernel_s_per_byte = proxy_s_per_byte = math.inf
     for _ in range(3):
-        before_bytes = wire.sent_bytes()
+        before_bytes = sent_bytes(wire)
         kernel_s = await asyncio.to_thread(_transfer, wire, size_bytes)
-        kernel_s_per_byte = min(kernel_s_per_byte, kernel_s / (wire.sent_bytes() - before_bytes))
+        kernel_s_per_byte = min(kernel_s_per_byte, kernel_s / (sent_bytes(wire) - before_bytes))
         proxy_s_per_byte = min(proxy_s_per_byte, await _through_proxy(size_bytes) / size_bytes)
     assert kernel_s_per_byte == pytest.approx(8 / RATE_BPS, rel=0.03)
     assert proxy_s_per_byte == pytest.approx(kernel_s_per_byte, rel=0.05)
@@ -190,8 +152,8 @@ async def test_the_proxy_takes_as_long_as_the_kernel_for_the_same_bytes(wire: Wi
 
 def _transfer(wire: Wire, size_bytes: int) -> float:
     """Return how long TCP takes through the kernel's bucket, from the first byte on."""
-    listener = within(wire.far, lambda: socket.create_server((wire.far_address, 0)))
-    near = within(wire.near, lambda: socket.create_connection(listener.getsockname(), 10))
+    listener = made_within(wire.far, lambda: socket.create_server((wire.far_address, 0)))
+    near = made_within(wire.near, lambda: socket.create_connection(listener.getsockname(), 10))
     far, _ = listener.accept()
     sender = threading.Thread(target=near.sendall, args=(bytes(size_bytes),))
     begin_s = time.perf_counter()
