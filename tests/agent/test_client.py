@@ -500,3 +500,16 @@ async def test_an_observer_that_gives_up_ends_the_stream_with_its_error(
     client.capture(0)
     with pytest.raises(RfedgeError, match=r"000\.png was lost 5 times"):
         await client.run()
+
+
+async def test_a_picture_withdrawn_for_another_server_is_lost_here(
+    open_client: OpenClient,
+) -> None:
+    heard = Heard()
+    client = open_client(MemoryServer(welcoming), heard)
+    client.capture(0)
+    client.withdraw()
+    client.finish()
+    await client.run()
+    assert heard.outcomes == [(0, "lost")]
+    assert heard.results[0].reason is EndReason.HANDED_OVER

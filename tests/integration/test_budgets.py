@@ -20,7 +20,7 @@ from structlog.testing import capture_logs
 from integration.conftest import random_field
 from live_server import Files, certificates, counted, held, limited, until, watched
 from mec_server.config import AdmissionLimits, IdentityBudget, SessionLimits
-from mec_server.session import DecodeJob
+from mec_server.session import MAX_UNUSABLE, DecodeJob
 from rfcore.field import save_field
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
@@ -241,6 +241,34 @@ async def test_openings_that_fail_again_and_again_make_their_vehicle_wait(
 
 
 # --- frames
+
+
+async def test_streams_that_end_with_unusable_frames_make_their_vehicle_wait(
+    serve: Any, raw_vehicle: Any, coded: Any
+) -> None:
+    damaged = replace(coded.frames[0], packet=replace(coded.frames[0].packet, crc32=1))
+
+    async def wasted_stream(server: Any) -> None:
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.greet(coded.hello)
+            for _ in range(MAX_UNUSABLE):
+                await vehicle.say(damaged)
+            assert await vehicle.end() is EXHAUSTED
+            assert "could not be used" in await vehicle.stream.details()
+
+    async with serve() as server:
+        for _ in range(2):
+            await wasted_stream(server)
+        async with raw_vehicle(server.address) as honest:
+            await honest.greet(coded.hello)
+            assert await honest.told(coded.frames[0]) == ("ack", 0)
+        for _ in range(3):
+            await wasted_stream(server)
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.say(coded.hello)
+            assert await vehicle.end() is EXHAUSTED
+            assert "3 openings of this vehicle came to nothing" in await vehicle.stream.details()
+        assert limited(server, "failed_openings") == 1
 
 
 async def test_a_frame_that_could_not_be_decoded_in_time_is_not_rendered(
