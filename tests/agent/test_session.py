@@ -11,12 +11,12 @@ from cav_agent.frames import (
     EncodedFrame,
     EncodeJob,
     EndReason,
-    FrameResult,
     Outcome,
     StreamEnd,
 )
 from cav_agent.session import AgentSession, LinkState, OutgoingMessage
 from rfcore.errors import InvalidInput, RejectReason, RfedgeError
+from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -33,25 +33,68 @@ MakeCapture = Callable[..., Capture]
 Encode = Callable[..., EncodedFrame]
 
 UNAVAILABLE = StreamEnd(EndReason.STREAM_LOST, "UNAVAILABLE: connection reset")
+UNREADABLE = Nack(FrameAddress("", 0, 0), RejectReason.INVALID_ARGUMENT, "garbage")
 
 
-def send(session: AgentSession, capture: Capture, encode: Encode, now: float = 1.0) -> Frame:
-    """Offer, encode and send one picture; return the frame as the server would get it."""
-    session.offer(capture)
-    job = session.job_to_start(0.0)
-    assert job is not None
-    session.encoded(encode(job), now)
-    (outgoing,) = session.messages_to_send(now)
-    assert isinstance(outgoing.message, Frame)
-    return outgoing.message
+class Sender:
+    """A vehicle's session with plenty of credit; sends pictures and remembers their jobs."""
+
+    def __init__(self, session: AgentSession, make_capture: MakeCapture, encode: Encode) -> None:
+        self.session = session
+        self.jobs: list[EncodeJob] = []
+        self._make_capture = make_capture
+        self._encode = encode
+        session.receive(Credit("front", 99), 0.0)
+
+    def connect(self, session_id: str, *, exact: bool = True) -> None:
+        """Connect again, be welcomed and get some credit."""
+        self.session.connected(3.0)
+        self.session.messages_to_send(3.0)
+        self.session.receive(Welcome(session_id, exact=exact), 3.0)
+        self.session.receive(Credit("front", 99), 3.0)
+
+    def start(self, captured_s: float = 0.0) -> EncodeJob:
+        """Offer the next picture, which is encoded at once."""
+        self.session.offer(self._make_capture(len(self.jobs), captured_s))
+        job = self.session.job_to_start(0.0)
+        assert job is not None
+        self.jobs.append(job)
+        return job
+
+    def finish(self, payload_bytes: int = 100, now: float = 1.0, read_s: float = 0.0) -> None:
+        """Have the encoder be done."""
+        encoded = self._encode(self.jobs[-1], payload_bytes)
+        self.session.encoded(replace(encoded, read_s=read_s), now)
+
+    def written(self, now: float = 1.0) -> list[Frame]:
+        """Return the frames that are to be written to the stream."""
+        outgoing = [entry.message for entry in self.session.messages_to_send(now)]
+        return [message for message in outgoing if isinstance(message, Frame)]
+
+    def send(self, captured_s: float = 0.0, now: float = 1.0, read_s: float = 0.0) -> Frame:
+        """Offer, encode and send one picture; return the frame as the server would get it."""
+        self.start(captured_s)
+        self.finish(now=now, read_s=read_s)
+        (frame,) = self.written(now)
+        return frame
+
+    def acked(self, frame: Frame, digest: bytes = b"d" * 16, total_ns: int = 0) -> None:
+        """Acknowledge a frame at second 2."""
+        self.session.receive(Ack(frame.address, StageTimes(total_ns=total_ns), digest), 2.0)
+
+    def nacked(self, frame: Frame, reason: RejectReason, **more: int) -> None:
+        """Refuse a frame at second 2."""
+        self.session.receive(Nack(frame.address, reason, "problem", **more), 2.0)
+
+    def outcomes(self) -> list[tuple[int, str]]:
+        """Return how pictures ended since this was asked last."""
+        results = self.session.take_results()
+        return [(result.capture.index, str(result.outcome)) for result in results]
 
 
-def ack(frame: Frame, total_ns: int = 0) -> Ack:
-    return Ack(frame.address, StageTimes(total_ns=total_ns), b"d" * 16)
-
-
-def outcomes(results: list[FrameResult]) -> list[tuple[int, str]]:
-    return [(result.capture.index, str(result.outcome)) for result in results]
+@pytest.fixture
+def sender(session: AgentSession, make_capture: MakeCapture, encode: Encode) -> Sender:
+    return Sender(session, make_capture, encode)
 
 
 # --- greeting
@@ -103,41 +146,34 @@ def test_the_newest_picture_wins_and_the_older_is_reported_dropped(
     job = session.job_to_start(0.0)
     assert job is not None
     assert job.capture.index == 3
-    assert outcomes(session.take_results()) == [(0, "dropped"), (1, "dropped"), (2, "dropped")]
+    assert [r.capture.index for r in session.take_results()] == [0, 1, 2]
 
 
-def test_credit_bounds_what_is_sent_and_answers_free_it(
+def test_credit_bounds_what_is_sent_and_never_falls(
     session: AgentSession, make_capture: MakeCapture, encode: Encode
 ) -> None:
-    first = send(session, make_capture(0), encode)
-    send(session, make_capture(1), encode)
+    session.receive(Credit("front", 1), 0.0)
+    for index in range(2):
+        session.offer(make_capture(index))
+        job = session.job_to_start(0.0)
+        assert job is not None
+        session.encoded(encode(job), 1.0)
     session.offer(make_capture(2))
     assert session.job_to_start(0.0) is None
-    session.receive(ack(first), 2.0)
     session.receive(Credit("front", 3), 2.0)
     assert session.job_to_start(0.0) is not None
 
 
-def test_credit_never_falls(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    session.receive(Credit("front", 1), 0.0)
-    send(session, make_capture(0), encode)
-    send(session, make_capture(1), encode)
-
-
-def test_an_ack_ends_a_picture_with_its_sizes_and_times(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    frame = send(session, make_capture(0, captured_s=0.5), encode, now=1.0)
-    session.receive(ack(frame, total_ns=250_000_000), 2.0)
-    (result,) = session.take_results()
+def test_an_ack_ends_a_picture_with_its_sizes_and_times(sender: Sender) -> None:
+    frame = sender.send(captured_s=0.5)
+    sender.acked(frame, total_ns=250_000_000)
+    (result,) = sender.session.take_results()
     assert result.outcome is Outcome.ACKED
     assert result.packet == frame.packet
-    assert result.packet_bytes > len(frame.packet.payload)
+    assert result.packet_bytes == len(client_message_to_bytes(frame))
     assert (result.latency_s, result.link_s) == (1.5, 0.75)
     assert result.server_digest == frame.packet.reconstruction_digest
-    assert session.is_idle
+    assert sender.session.is_idle
 
 
 @pytest.mark.parametrize(
@@ -148,13 +184,11 @@ def test_an_ack_ends_a_picture_with_its_sizes_and_times(
         pytest.param([1, 1, 0, 0], id="both"),
     ],
 )
-def test_answers_in_any_order_end_each_picture_once(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode, order: list[int]
-) -> None:
-    frames = [send(session, make_capture(i), encode) for i in range(2)]
+def test_answers_in_any_order_end_each_picture_once(sender: Sender, order: list[int]) -> None:
+    frames = [sender.send() for _ in range(2)]
     for number in order:
-        session.receive(ack(frames[number]), 2.0)
-    assert sorted(outcomes(session.take_results())) == [(0, "acked"), (1, "acked")]
+        sender.acked(frames[number])
+    assert sorted(sender.outcomes()) == [(0, "acked"), (1, "acked")]
 
 
 def test_an_answer_to_a_frame_never_sent_is_ignored(session: AgentSession) -> None:
@@ -166,49 +200,38 @@ def test_an_answer_to_a_frame_never_sent_is_ignored(session: AgentSession) -> No
 # --- recovery
 
 
-def test_after_a_nack_the_next_packet_begins_a_new_epoch(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    frame = send(session, make_capture(0), encode)
-    session.receive(Nack(frame.address, RejectReason.CRC_MISMATCH, "crc"), 2.0)
-    (result,) = session.take_results()
+def test_after_a_nack_the_next_packet_begins_a_new_epoch(sender: Sender) -> None:
+    sender.nacked(sender.send(), RejectReason.CRC_MISMATCH)
+    (result,) = sender.session.take_results()
     assert result.outcome is Outcome.NACKED
-    assert (result.reason, result.problem) == (RejectReason.CRC_MISMATCH, "crc")
-    after = send(session, make_capture(1), encode)
+    assert (result.reason, result.problem) == (RejectReason.CRC_MISMATCH, "problem")
+    after = sender.send()
     assert (after.packet.epoch, after.packet.sequence) == (1, 0)
 
 
-def test_a_server_in_a_later_epoch_is_overtaken(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    frame = send(session, make_capture(0), encode)
-    nack = Nack(frame.address, RejectReason.STALE_EPOCH, "epoch 0 is over", current_epoch=700)
-    session.receive(nack, 2.0)
-    assert send(session, make_capture(1), encode).packet.epoch == 701
+def test_a_server_in_a_later_epoch_is_overtaken(sender: Sender) -> None:
+    sender.nacked(sender.send(), RejectReason.STALE_EPOCH, current_epoch=700)
+    assert sender.send().packet.epoch == 701
 
 
-def test_a_nack_of_a_gap_covers_all_its_sequences(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    frames = [send(session, make_capture(i), encode) for i in range(2)]
-    session.receive(Nack(frames[0].address, RejectReason.SEQUENCE_GAP, "lost", count=2), 2.0)
-    assert outcomes(session.take_results()) == [(0, "nacked"), (1, "nacked")]
+def test_a_nack_of_a_gap_covers_all_its_sequences(sender: Sender) -> None:
+    first, _ = sender.send(), sender.send()
+    sender.nacked(first, RejectReason.SEQUENCE_GAP, count=2)
+    assert sender.outcomes() == [(0, "nacked"), (1, "nacked")]
 
 
-def test_an_overloaded_server_loses_the_frame_without_judging_it(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    frame = send(session, make_capture(0), encode)
-    session.receive(Nack(frame.address, RejectReason.OVERLOADED, "shutting down"), 2.0)
-    assert outcomes(session.take_results()) == [(0, "lost")]
+def test_an_overloaded_server_loses_the_frame_without_judging_it(sender: Sender) -> None:
+    sender.nacked(sender.send(), RejectReason.OVERLOADED)
+    assert sender.outcomes() == [(0, "lost")]
 
 
 def test_a_lost_connection_loses_what_was_unanswered_and_the_next_starts_afresh(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
+    sender: Sender, make_capture: MakeCapture
 ) -> None:
-    send(session, make_capture(0), encode)
+    session = sender.session
+    sender.send()
     session.connection_lost(UNAVAILABLE, 2.0)
-    assert outcomes(session.take_results()) == [(0, "lost")]
+    assert sender.outcomes() == [(0, "lost")]
     session.connected(3.0)
     session.messages_to_send(3.0)
     session.receive(Welcome("s-2", exact=True), 3.0)
@@ -229,24 +252,18 @@ def test_a_failed_first_connection_costs_no_epoch(hello: Hello) -> None:
     assert session.epoch == 0
 
 
-def test_a_picture_encoded_for_a_lost_connection_is_lost(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    session.offer(make_capture(0))
-    job = session.job_to_start(0.0)
-    assert job is not None
-    session.connection_lost(UNAVAILABLE, 1.0)
-    session.connected(1.1)
-    session.receive(Welcome("s-2", exact=True), 1.1)
-    session.encoded(encode(job), 1.2)
-    assert outcomes(session.take_results()) == [(0, "lost")]
-    assert not any(isinstance(m.message, Frame) for m in session.messages_to_send(1.2))
+def test_a_picture_encoded_for_a_lost_connection_is_lost(sender: Sender) -> None:
+    sender.start()
+    sender.session.connection_lost(UNAVAILABLE, 1.0)
+    sender.connect("s-2")
+    sender.finish(now=3.2)
+    assert sender.outcomes() == [(0, "lost")]
+    assert sender.written() == []
 
 
-def test_an_answer_that_does_not_come_breaks_the_stream(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    send(session, make_capture(0), encode, now=1.0)
+def test_an_answer_that_does_not_come_breaks_the_stream(sender: Sender) -> None:
+    sender.send()
+    session = sender.session
     assert session.get_timer() == 6.0
     session.handle_timer(5.9)
     assert session.broken is None
@@ -254,78 +271,55 @@ def test_an_answer_that_does_not_come_breaks_the_stream(
     assert session.broken == StreamEnd(EndReason.NO_ANSWER, "no answer to a frame within 5 s")
 
 
-def test_a_picture_that_cannot_be_coded_uses_no_credit(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    for index in range(3):
-        session.offer(make_capture(index))
-        assert session.job_to_start(0.0) is not None
-        session.encoding_failed(RfedgeError("not a readable picture"))
-    assert outcomes(session.take_results()) == [(i, "dropped") for i in range(3)]
-    assert send(session, make_capture(3), encode).packet.sequence == 0
+def test_a_picture_that_cannot_be_coded_uses_no_credit(sender: Sender) -> None:
+    for _ in range(3):
+        sender.start()
+        sender.session.encoding_failed(RfedgeError("not a readable picture"))
+    assert sender.outcomes() == [(i, "dropped") for i in range(3)]
+    assert sender.send().packet.sequence == 0
 
 
-def test_a_payload_no_server_would_take_is_dropped_here(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    session.offer(make_capture(0))
-    job = session.job_to_start(0.0)
-    assert isinstance(job, EncodeJob)
-    session.encoded(encode(job, 1_000_001), 1.0)
-    assert session.messages_to_send(1.0) == []
-    (result,) = session.take_results()
+def test_a_payload_no_server_would_take_is_dropped_here(sender: Sender) -> None:
+    sender.start()
+    sender.finish(1_000_001)
+    assert sender.written() == []
+    (result,) = sender.session.take_results()
     assert result.outcome is Outcome.DROPPED
     assert result.reason is EndReason.OVERSIZE
     assert result.problem.startswith("1000001 bytes of payload exceed")
 
 
-def test_loading_a_picture_is_no_part_of_its_latency(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
-    def encode_slowly_read(job: EncodeJob) -> EncodedFrame:
-        return replace(encode(job), read_s=0.25)
-
-    frame = send(session, make_capture(0, captured_s=0.5), encode_slowly_read)
-    session.receive(ack(frame), 2.0)
-    (result,) = session.take_results()
+def test_loading_a_picture_is_no_part_of_its_latency(sender: Sender) -> None:
+    sender.acked(sender.send(captured_s=0.5, read_s=0.25))
+    (result,) = sender.session.take_results()
     assert result.latency_s == 1.25
     assert result.stage_s == {"read": 0.25, "render": 0.01, "encode": 0.02}
     assert result.encoded is not None
     assert result.encoded.sender_s == pytest.approx(0.03)
 
 
-def test_a_frame_refused_before_it_was_written_is_still_written(
-    session: AgentSession, make_capture: MakeCapture, encode: Encode
-) -> None:
+def test_a_frame_refused_before_it_was_written_is_still_written(sender: Sender) -> None:
     """It has used its credit; a Nack of something unreadable ended it meanwhile."""
-    session.offer(make_capture(0))
-    job = session.job_to_start(0.0)
-    assert job is not None
-    session.encoded(encode(job), 1.0)
-    session.receive(Nack(FrameAddress("", 0, 0), RejectReason.INVALID_ARGUMENT, "garbage"), 1.1)
-    (outgoing,) = session.messages_to_send(1.2)
-    assert isinstance(outgoing.message, Frame)
-    session.receive(ack(outgoing.message), 2.0)
-    assert outcomes(session.take_results()) == [(0, "nacked")], "it ends once"
+    sender.start()
+    sender.finish()
+    sender.session.receive(UNREADABLE, 1.1)
+    (frame,) = sender.written(1.2)
+    sender.acked(frame)
+    assert sender.outcomes() == [(0, "nacked")], "it ends once"
 
 
 def test_an_abandoned_session_ends_every_picture_it_took(
-    hello: Hello, make_capture: MakeCapture, encode: Encode
+    sender: Sender, make_capture: MakeCapture
 ) -> None:
-    session = AgentSession(hello)
-    session.connected(0.0)
-    session.receive(Welcome("s-1", exact=True), 0.0)
-    session.receive(Credit("front", 3), 0.0)
-    session.messages_to_send(0.0)
-    send(session, make_capture(0), encode)
-    session.offer(make_capture(1))
-    assert session.job_to_start(1.0) is not None
-    session.offer(make_capture(2))
-    session.abandon(StreamEnd(EndReason.ABANDONED, "its stream was given up"), 2.0)
-    results = session.take_results()
-    assert sorted(outcomes(results)) == [(0, "lost"), (1, "lost"), (2, "lost")]
+    sender.send()
+    sender.start()
+    sender.session.offer(make_capture(2))
+    sender.session.abandon(StreamEnd(EndReason.ABANDONED, "its stream was given up"), 2.0)
+    results = sender.session.take_results()
+    ended = sorted((result.capture.index, str(result.outcome)) for result in results)
+    assert ended == [(0, "lost"), (1, "lost"), (2, "lost")]
     assert {result.reason for result in results} == {EndReason.ABANDONED}
-    assert session.is_idle
+    assert sender.session.is_idle
 
 
 @pytest.mark.parametrize(
@@ -340,3 +334,88 @@ def test_an_abandoned_session_ends_every_picture_it_took(
 def test_bad_limits_are_refused_by_name(change: dict[str, float], named: str) -> None:
     with pytest.raises(InvalidInput, match=named):
         AgentLimits(**change)  # type: ignore[arg-type]
+
+
+# --- which frame the next one is predicted from: the last sent, or after a loss the last decoded
+
+
+def test_a_frame_is_predicted_from_the_one_sent_before_it(sender: Sender) -> None:
+    frames = [sender.send() for _ in range(3)]
+    assert [job.base for job in sender.jobs] == [None, frames[0].address, frames[1].address]
+
+
+def test_after_a_loss_the_next_frame_goes_back_to_the_last_one_decoded(sender: Sender) -> None:
+    first, second, _ = (sender.send() for _ in range(3))
+    sender.acked(first)
+    sender.nacked(second, RejectReason.CRC_MISMATCH)
+    again = sender.send()
+    assert sender.jobs[-1].base == first.address
+    assert again.packet.epoch == 1
+
+
+def test_refusals_that_follow_from_one_loss_begin_no_further_epoch(sender: Sender) -> None:
+    first, second, third = (sender.send() for _ in range(3))
+    sender.acked(first)
+    sender.nacked(second, RejectReason.CRC_MISMATCH)
+    healed = sender.send()
+    sender.nacked(third, RejectReason.UNKNOWN_STATE)
+    following = sender.send()
+    assert sender.jobs[-1].base == healed.address
+    assert following.packet.epoch == 1
+
+
+def test_a_server_that_lost_its_frames_is_sent_one_that_needs_none(sender: Sender) -> None:
+    first = sender.send()
+    sender.acked(first)
+    second = sender.send()
+    sender.nacked(second, RejectReason.UNKNOWN_STATE)
+    sender.send()
+    assert sender.jobs[-1].base is None
+
+
+def test_a_frame_decoded_to_something_else_is_no_base(sender: Sender) -> None:
+    first = sender.send()
+    sender.acked(first, b"x" * 16)
+    second = sender.send()
+    sender.nacked(second, RejectReason.DECODER_FAILED)
+    sender.send()
+    assert sender.jobs[-1].base is None
+
+
+def test_a_frame_encoded_on_a_lost_base_is_not_sent(sender: Sender) -> None:
+    first, second = sender.send(), sender.send()
+    sender.acked(first)
+    sender.start()
+    sender.nacked(second, RejectReason.CRC_MISMATCH)
+    sender.finish()
+    assert sender.written() == []
+    reasons = [result.reason for result in sender.session.take_results()]
+    assert EndReason.BASE_LOST in reasons
+    sender.send()
+    assert sender.jobs[-1].base == first.address
+
+
+def test_a_frame_too_large_to_send_is_no_base(sender: Sender) -> None:
+    first = sender.send()
+    sender.acked(first)
+    sender.start()
+    sender.finish(payload_bytes=1 << 20)
+    assert sender.written() == []
+    sender.send()
+    assert sender.jobs[-1].base == first.address
+
+
+def test_another_connection_begins_without_a_base(sender: Sender) -> None:
+    sender.acked(sender.send())
+    sender.session.connection_lost(UNAVAILABLE, 3.0)
+    sender.connect("s-2")
+    sender.send()
+    assert sender.jobs[-1].base is None
+
+
+def test_between_inexact_renderers_no_frame_has_a_base(sender: Sender) -> None:
+    sender.session.connection_lost(UNAVAILABLE, 0.0)
+    sender.connect("s-2", exact=False)
+    sender.acked(sender.send())
+    sender.send()
+    assert [(job.base, job.exact) for job in sender.jobs] == [(None, False)] * 2

@@ -28,6 +28,7 @@ from rfcore.dataset import read_dataset
 from rfcore.dataset.rig import RIG_FILE, Rig, RigCamera, write_rig
 from rfcore.field import SplatField, save_field
 from rfcore.image import Rgb, write_png
+from rfcore.perception import contacts
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
@@ -394,3 +395,11 @@ def vehicle(street: Street, tmp_path: Path) -> Callable[..., Any]:
             await asyncio.gather(driving.task, return_exceptions=True)
 
     return drive
+
+
+@pytest.fixture
+def small_things(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Things in pictures of 76x52 count, though the field is a cloud, without ground."""
+    for name in ("LEAST_PX", "LEAST_COLUMNS", "LEAST_WIDTH_M", "LEAST_MARKED_M"):
+        monkeypatch.setattr(contacts, name, 0)
+    monkeypatch.setattr(contacts, "MOST_SLOPE", 1.0)

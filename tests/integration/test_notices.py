@@ -22,7 +22,6 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.h264.config import CoderSettings
 from rfcore.codec.packet import DeltaPacket
 from rfcore.native.yuv import field_view_from_view
-from rfcore.perception import contacts
 from rfcore.perception.composition import LivePicture
 from rfcore.perception.ground import FieldGround
 from rfcore.wire.conventions import CONSUMER_OPTIONS
@@ -37,11 +36,7 @@ from rfedge.loadtest.prerecorded import PrerecordedDrive
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("LEAST_PX", "LEAST_COLUMNS", "LEAST_WIDTH_M", "LEAST_MARKED_M"):
-        monkeypatch.setattr(contacts, name, 0)  # of a picture of 76x52
-    monkeypatch.setattr(contacts, "MOST_SLOPE", 1.0)  # the field is a cloud, without ground
+pytestmark = pytest.mark.usefixtures("small_things")
 
 
 def as_vehicle(hello: Hello, name: str, *, takes: bool) -> Hello:

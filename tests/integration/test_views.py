@@ -20,7 +20,6 @@ from mec_server.twin import rendering
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import LimitExceeded
 from rfcore.field import save_field
-from rfcore.perception import contacts
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.messages import Frame
 from rfcore.wire.publish import Ground, publish
@@ -125,12 +124,10 @@ def a_tenth_apart(frames: Sequence[Frame]) -> list[Frame]:
     ]
 
 
+@pytest.mark.usefixtures("small_things")
 async def test_a_place_of_the_world_names_its_tile_and_is_where_the_pose_is_relative_to(
-    street: Any, coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path, monkeypatch: Any
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path
 ) -> None:
-    for name in ("LEAST_PX", "LEAST_COLUMNS", "LEAST_WIDTH_M", "LEAST_MARKED_M"):
-        monkeypatch.setattr(contacts, name, 0)  # of a picture of 76x52
-    monkeypatch.setattr(contacts, "MOST_SLOPE", 1.0)
     ground = Ground(Area((-50.0, -50.0), (50.0, 50.0)), 5.0)
     publish(tmp_path, "west", street.store / "street.rff", ground, datetime.now(UTC))
     place = TileOrigin(10.0, 20.0, 1.0)
@@ -369,13 +366,11 @@ async def test_a_view_that_nobody_waits_for_any_more_is_not_drawn(
     assert len(drawn) == 2
 
 
+@pytest.mark.usefixtures("small_things")
 async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
-    street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
     """The red box of the drive, once three pictures have shown it, until it is forgotten."""
-    for name in ("LEAST_PX", "LEAST_COLUMNS", "LEAST_WIDTH_M", "LEAST_MARKED_M"):
-        monkeypatch.setattr(contacts, name, 0)  # of a picture of 76x52
-    monkeypatch.setattr(contacts, "MOST_SLOPE", 1.0)  # the field is a cloud, without ground
 
     def classify(crop: np.ndarray) -> str:
         red, green, blue = crop.reshape(-1, 3).mean(axis=0)

@@ -32,7 +32,8 @@ async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> No
 async def linked(handler: Handler, **changes: Any) -> AsyncIterator[LinkProxy]:
     server = await asyncio.start_server(handler, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
-    proxy = LinkProxy(ProxySettings(f"127.0.0.1:{port}", **{**FAST, **changes}))
+    link = changes if "profile" in changes else FAST | changes
+    proxy = LinkProxy(ProxySettings(f"127.0.0.1:{port}", **link))
     await proxy.start()
     try:
         yield proxy
@@ -172,32 +173,20 @@ async def test_a_profile_s_outage_holds_what_comes_during_it(profile: Callable[.
     path = profile("rate_mbps = 100.0\n[uplink.outage]\nat_s = [[0.0, 0.4]]")
     clock = asyncio.get_running_loop().time
     started_s = clock()
-    server = await asyncio.start_server(echo, "127.0.0.1", 0)
-    proxy = LinkProxy(
-        ProxySettings(f"127.0.0.1:{server.sockets[0].getsockname()[1]}", profile=path)
-    )
-    await proxy.start()
-    assert await exchange(proxy, b"through") == b"through"
-    assert clock() - started_s >= 0.4
-    await proxy.stop()
-    server.close()
+    async with linked(echo, profile=path) as proxy:
+        assert await exchange(proxy, b"through") == b"through"
+        assert clock() - started_s >= 0.4
 
 
 async def test_connections_are_lost_as_the_profile_says_and_counted(
     profile: Callable[..., Path],
 ) -> None:
     path = profile(end="[connection_loss]\nmean_life_s = 0.05")
-    server = await asyncio.start_server(echo, "127.0.0.1", 0)
-    proxy = LinkProxy(
-        ProxySettings(f"127.0.0.1:{server.sockets[0].getsockname()[1]}", profile=path)
-    )
-    await proxy.start()
-    reader, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
-    with suppress(ConnectionResetError):
-        assert await reader.read() == b"", "nothing was sent; the end comes when it is cut"
-    writer.close()
-    await proxy.stop()
-    server.close()
+    async with linked(echo, profile=path) as proxy:
+        reader, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
+        with suppress(ConnectionResetError):
+            assert await reader.read() == b"", "nothing was sent; the end comes when it is cut"
+        writer.close()
     assert proxy.report()["connections_cut"] == 1
     assert proxy.registry.get_sample_value("rfedge_link_connections_cut_total") == 1
 
