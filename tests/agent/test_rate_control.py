@@ -1,41 +1,31 @@
 """The delay is kept and quality falls: the vehicle's session over links on a virtual clock."""
 
-import heapq
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from random import Random
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
-from cav_agent.rate_control import LEAST_CAMERA_SHARE, BitDivision, ByteBudget, RateControl
+from agent.link_world import LOWEST_CRF, ModelCoder, World
+from cav_agent.frames import Capture, FrameResult, Outcome
+from cav_agent.rate_control import LEAST_CAMERA_SHARE, BitDivision, RateControl
 from cav_agent.session import AgentSession
-from rfcore.camera import Pose
-from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import InvalidInput
 from rfcore.link import LinkProfile
 from rfcore.link.plan import read_link
 from rfcore.link.shaper import Link, LinkParts
 from rfcore.wire.messages import (
-    Ack,
-    Credit,
-    Frame,
     FrameAddress,
     Hello,
-    ServerMessage,
-    StageTimes,
-    Welcome,
 )
 
 RATE_HZ = 10
 CODING_S = 0.04
 ANSWERING_S = 0.02
-LOWEST_CRF = 23.0
 BYTES_AT_LOWEST = 20_000
 
 
@@ -69,70 +59,6 @@ class Picture:
     payload_bytes: int = 0
 
 
-@dataclass
-class ModelCoder:
-    """A coder whose rate halves every 6 CRF and strays by a fifth."""
-
-    random: Random
-    sequence: int = 0
-
-    def __call__(self, job: EncodeJob) -> EncodedFrame:
-        budget = job.budget or ByteBudget(BYTES_AT_LOWEST, BYTES_AT_LOWEST)
-        crf = LOWEST_CRF + 6 * np.log2(BYTES_AT_LOWEST / budget.target_bytes)
-        crf = min(51.0, max(LOWEST_CRF, crf))
-        size_bytes = BYTES_AT_LOWEST * 2 ** ((LOWEST_CRF - crf) / 6)
-        size_bytes = int(size_bytes * 2 ** self.random.uniform(-0.3, 0.3))
-        digest, payload = b"d" * 16, bytes(size_bytes)
-        packet = DeltaPacket(job.epoch, self.sequence, digest, b"", digest, payload, 0)
-        self.sequence += 1
-        return EncodedFrame(packet, {"encode": CODING_S}, Pose.identity(), crf=crf)
-
-
-@dataclass
-class World:
-    """A session, a coder and an uplink; coding takes ``CODING_S``, whatever it took."""
-
-    session: AgentSession
-    uplink: Link[FrameAddress]
-    code: Callable[[EncodeJob], EncodedFrame]
-
-    def drive(self, captures: list[Capture]) -> list[Picture]:
-        """Return what became of the pictures, in the order of their ends."""
-        order = itertools.count()
-        events = [(capture.captured_s, next(order), capture) for capture in captures]
-        heapq.heapify(events)
-        ended: list[FrameResult] = []
-        while events:
-            now, _, event = heapq.heappop(events)
-            match event:
-                case Capture():
-                    self.session.offer(event)
-                case EncodedFrame():
-                    self.session.encoded(event, now)
-                case _:
-                    self.session.receive(event, now)
-            job = self.session.job_to_start(now)
-            if job is not None:
-                heapq.heappush(events, (now + CODING_S, next(order), self.code(job)))
-            for at_s, answer in self.send(now):
-                heapq.heappush(events, (at_s, next(order), answer))
-            ended += self.session.take_results()
-        return [_picture(result) for result in ended]
-
-    def send(self, now: float) -> list[tuple[float, ServerMessage]]:
-        answers: list[tuple[float, ServerMessage]] = []
-        for outgoing in self.session.messages_to_send(now):
-            message = outgoing.message
-            if isinstance(message, Frame):
-                size_bytes = len(message.packet.payload) + 150
-                due_s = self.uplink.push(message.address, size_bytes, now).due_s
-                digest = message.packet.reconstruction_digest
-                ack = Ack(message.address, StageTimes(), digest)
-                answers.append((due_s + ANSWERING_S, ack))
-                answers.append((due_s + ANSWERING_S, Credit("front", message.address.sequence + 3)))
-        return answers
-
-
 def _picture(result: FrameResult) -> Picture:
     delay_s = result.latency_s if result.outcome is Outcome.ACKED else None
     size_bytes = len(result.packet.payload) if result.packet else 0
@@ -141,24 +67,15 @@ def _picture(result: FrameResult) -> Picture:
 
 
 @pytest.fixture
-def drive_over(
-    hello: Hello,
-    make_capture: Callable[..., Capture],
-) -> Callable[..., list[Picture]]:
+def drive_over(hello: Hello, make_capture: Callable[..., Capture]) -> Callable[..., list[Picture]]:
     def run(
-        uplink: Link[FrameAddress],
-        max_delay_s: float | None = 0.2,
-        seconds: float = 40.0,
-        code: Callable[[EncodeJob], EncodedFrame] | None = None,
+        uplink: Link[FrameAddress], max_delay_s: float | None = 0.2, seconds: float = 40.0
     ) -> list[Picture]:
         control = None if max_delay_s is None else RateControl(max_delay_s)
-        session = AgentSession(hello, rate_control=control)
-        session.connected(0.0)
-        session.messages_to_send(0.0)
-        session.receive(Welcome("s", True), 0.0)
-        session.receive(Credit("front", 2), 0.0)
-        captures = [make_capture(i, i / RATE_HZ) for i in range(int(seconds * RATE_HZ))]
-        return World(session, uplink, code or ModelCoder(Random(5))).drive(captures)
+        coder = ModelCoder({"front": BYTES_AT_LOWEST}, CODING_S, spread=0.3)
+        world = World(AgentSession(hello, rate_control=control), uplink, coder, ANSWERING_S)
+        captures = [(make_capture(i, i / RATE_HZ),) for i in range(int(seconds * RATE_HZ))]
+        return list(map(_picture, world.drive(captures)))
 
     return run
 

@@ -40,15 +40,16 @@ async def unread_fetches(target: Target) -> None:
 
 async def decoders_for_nothing(target: Target) -> None:
     """8 streams with 16 cameras each, a decoder process for each camera."""
-    data = client_message_to_bytes(hello(target, 640, 360, 16))
+    asked = hello(target, 640, 360, 16)
+    await all_of(*(for_ever(lambda: hello_and_wait(target, asked, 2.0)) for _ in range(8)))
 
-    async def stream() -> None:
-        async with target.channel() as channel:
-            call = channel.stream_stream(STREAM_METHOD)()
-            await call.write(data)
-            await asyncio.sleep(2.0)
 
-    await all_of(*(for_ever(stream) for _ in range(8)))
+async def hello_and_wait(target: Target, asked: Hello, wait_s: float) -> None:
+    """Say Hello on a connection of its own, and leave after a while."""
+    async with target.channel() as channel:
+        call = channel.stream_stream(STREAM_METHOD)()
+        await call.write(client_message_to_bytes(asked))
+        await asyncio.sleep(wait_s)
 
 
 async def decoders_within_budget(target: Target) -> None:
@@ -71,22 +72,36 @@ async def hold_stream(target: Target, asked: Hello) -> None:
     await for_ever(stream, 0.1)
 
 
-async def frames_that_cost_a_render(
-    target: Target, *, good_crc: bool, size: tuple[int, int]
+async def send_for_ever(
+    target: Target,
+    size: tuple[int, int],
+    message: Callable[[int], bytes],
+    every_s: float,
+    streams: int = 1,
 ) -> None:
+    """Send ``message(0)``, ``message(1)``, ... after a Hello on each stream, again when it ends."""
     greeting = client_message_to_bytes(hello(target, *size))
 
     async def messages() -> AsyncIterator[bytes]:
         yield greeting
-        for sequence in range(100_000):
-            yield client_message_to_bytes(frame(sequence, good_crc=good_crc, payload=b"\x41junk"))
-            await asyncio.sleep(0.002)
+        for number in range(1_000_000):
+            yield message(number)
+            await asyncio.sleep(every_s)
 
     async def stream() -> None:
         async with target.channel() as channel:
             await stream_of(channel, messages())
 
-    await all_of(*(for_ever(stream, 0.05) for _ in range(4)))
+    await all_of(*(for_ever(stream, 0.05) for _ in range(streams)))
+
+
+async def frames_that_cost_a_render(
+    target: Target, *, good_crc: bool, size: tuple[int, int]
+) -> None:
+    def message(number: int) -> bytes:
+        return client_message_to_bytes(frame(number, good_crc=good_crc, payload=b"\x41junk"))
+
+    await send_for_ever(target, size, message, 0.002, streams=4)
 
 
 async def bad_crc(target: Target) -> None:
@@ -101,15 +116,8 @@ async def junk_slices(target: Target) -> None:
 
 async def greedy_promise(target: Target) -> None:
     """One Hello that asks for 16 cameras of 1080p at 1000 Hz, then nothing."""
-    data = client_message_to_bytes(hello(target, 1920, 1080, 16, 1000.0))
-
-    async def stream() -> None:
-        async with target.channel() as channel:
-            call = channel.stream_stream(STREAM_METHOD)()
-            await call.write(data)
-            await asyncio.sleep(5.0)
-
-    await for_ever(stream)
+    asked = hello(target, 1920, 1080, 16, 1000.0)
+    await for_ever(lambda: hello_and_wait(target, asked, 5.0))
 
 
 async def greedy_promise_within_budget(target: Target) -> None:
@@ -162,20 +170,12 @@ async def unread_watches(target: Target) -> None:
 
 async def impossible_times(target: Target) -> None:
     """Frames captured at time 0 and at 2^63 - 1."""
-    greeting = client_message_to_bytes(hello(target, 320, 180))
 
-    async def messages() -> AsyncIterator[bytes]:
-        yield greeting
-        for sequence in range(100_000):
-            shown = frame(sequence, good_crc=True, captured_ns=(0, 2**63 - 1)[sequence % 2])
-            yield client_message_to_bytes(shown)
-            await asyncio.sleep(0.02)
+    def message(number: int) -> bytes:
+        captured_ns = (0, 2**63 - 1)[number % 2]
+        return client_message_to_bytes(frame(number, good_crc=True, captured_ns=captured_ns))
 
-    async def stream() -> None:
-        async with target.channel() as channel:
-            await stream_of(channel, messages())
-
-    await for_ever(stream, 0.05)
+    await send_for_ever(target, (320, 180), message, 0.02)
 
 
 async def many_streams(target: Target) -> None:
@@ -235,38 +235,20 @@ async def foreign_names(target: Target) -> None:
     await for_ever(stream, 0.01)
 
 
-async def stream_for_ever(
-    target: Target, greeting: bytes, messages: Callable[[int], bytes]
-) -> None:
-    """Send ``messages(0)``, ``messages(1)``, ... after a Hello, 200 a second, for ever."""
-
-    async def numbered() -> AsyncIterator[bytes]:
-        yield greeting
-        for number in range(1_000_000):
-            yield messages(number)
-            await asyncio.sleep(0.005)
-
-    async def stream() -> None:
-        async with target.channel() as channel:
-            await stream_of(channel, numbered())
-
-    await for_ever(stream, 0.05)
-
-
 async def refused_frames(target: Target) -> None:
     """Frames of another render, every second one left out: a Nack for each."""
-    greeting = client_message_to_bytes(hello(target, 320, 180))
-    await stream_for_ever(
-        target, greeting, lambda n: client_message_to_bytes(frame(2 * n + 1, good_crc=True))
-    )
+
+    def message(number: int) -> bytes:
+        return client_message_to_bytes(frame(2 * number + 1, good_crc=True))
+
+    await send_for_ever(target, (320, 180), message, 0.005)
 
 
 async def unknown_fields(target: Target) -> None:
     """Messages with 200,000 fields that nobody knows."""
     tag = bytes([0xF8, 0xFF, 0x07, 0x01])  # field 16383, varint 1
     many = tag * 200_000
-    greeting = client_message_to_bytes(hello(target, 320, 180))
-    await stream_for_ever(target, greeting, lambda _: many)
+    await send_for_ever(target, (320, 180), lambda _: many, 0.005)
 
 
 async def odd_numbers(target: Target) -> None:
@@ -282,8 +264,7 @@ async def odd_numbers(target: Target) -> None:
         del request.frame.pose_f32[:]
         return request.SerializeToString()
 
-    greeting = client_message_to_bytes(hello(target, 320, 180))
-    await stream_for_ever(target, greeting, message)
+    await send_for_ever(target, (320, 180), message, 0.005)
 
 
 async def foreign_paths(target: Target) -> None:
@@ -302,14 +283,8 @@ async def foreign_paths(target: Target) -> None:
 
 async def many_connections(target: Target) -> None:
     """300 connections of one identity, each with a Hello."""
-    data = client_message_to_bytes(hello(target, 320, 180))
-
-    async def connection() -> None:
-        async with target.channel() as channel:
-            await channel.stream_stream(STREAM_METHOD)().write(data)
-            await asyncio.sleep(2.0)
-
-    await all_of(*(for_ever(connection) for _ in range(300)))
+    asked = hello(target, 320, 180)
+    await all_of(*(for_ever(lambda: hello_and_wait(target, asked, 2.0)) for _ in range(300)))
 
 
 async def revoked(target: Target) -> None:
