@@ -20,7 +20,7 @@ from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin_client import TwinClient
 from rfedge.certs import Members, certify, write_certificates
 
-SOON_S = AgentLimits(give_up_s=5.0)
+SOON = AgentLimits(give_up_s=5.0)
 
 
 @pytest.fixture
@@ -34,11 +34,6 @@ def authority(tmp_path: Path) -> Callable[..., Files]:
 def certs(authority: Any) -> Files:
     files: Files = authority()
     return files
-
-
-def mixed(own: TlsFiles, trusted: TlsFiles) -> TlsFiles:
-    """What somebody shows who has a foreign certificate, and trusts the right authority."""
-    return replace(own, authority=trusted.authority)
 
 
 async def test_a_vehicle_with_its_certificate_drives_and_gets_its_field(
@@ -85,54 +80,47 @@ async def test_an_expired_vehicle_is_told_so_in_one_line(
     assert str(caught.value) == refused
 
 
-async def test_an_expired_server_is_not_trusted(authority: Any, serve: Any, travel: Any) -> None:
-    old = authority("old", age_days=60)
-    async with serve(tls=old("server")) as server:
-        with pytest.raises(AccessDenied, match="is refused: certificate has expired"):
-            await travel(server.address, tls=old("vehicle-cav-1"))
+@pytest.mark.parametrize(
+    ("server_has", "vehicle_has", "problem"),
+    [
+        ("old/server", "old/vehicle-cav-1", "is refused: certificate has expired"),
+        (
+            "certs/server",
+            "foreign/vehicle-cav-1",
+            r"certificate of .* is refused: .*foreign/ca\.pem",
+        ),
+        ("certs/vehicle-cav-2", "certs/vehicle-cav-1", "is refused: "),
+        ("certs/server", None, "wants TLS; give --tls-cert"),
+        (None, "certs/vehicle-cav-1", "speaks plaintext"),
+    ],
+    ids=["expired", "of another authority", "a vehicle's", "plaintext to TLS", "TLS to plaintext"],
+)
+async def test_a_server_that_is_not_trusted_gets_nothing_and_the_vehicle_says_why(
+    authority: Any, serve: Any, travel: Any,
+    server_has: str | None, vehicle_has: str | None, problem: str,
+) -> None:  # fmt: skip
+    def files(name: str | None) -> TlsFiles | None:
+        if name is None:
+            return None
+        folder, _, name = name.partition("/")
+        if folder not in made:
+            made[folder] = authority(folder, age_days=60 if folder == "old" else 0)
+        return made[folder](name)
+
+    made: dict[str, Files] = {}
+    async with serve(tls=files(server_has)) as server:
+        with pytest.raises(AccessDenied, match=problem):
+            await travel(server.address, tls=files(vehicle_has), limits=SOON)
 
 
 async def test_a_vehicle_of_another_authority_is_refused_by_the_server(
     authority: Any, certs: Files, serve: Any, travel: Any
 ) -> None:
-    foreign = authority("foreign")
+    """It shows a foreign certificate, and trusts the right authority."""
+    own = replace(authority("foreign")("vehicle-cav-1"), authority=certs("server").authority)
     async with serve(tls=certs("server")) as server:
-        tls = mixed(foreign("vehicle-cav-1"), certs("server"))
         with pytest.raises(AccessDenied, match=r"refuses .*1\.pem: unable to get local issuer"):
-            await travel(server.address, tls=tls)
-
-
-async def test_a_server_of_another_authority_is_refused_by_the_vehicle(
-    authority: Any, certs: Files, serve: Any, travel: Any
-) -> None:
-    foreign = authority("foreign")
-    async with serve(tls=certs("server")) as server:
-        with pytest.raises(AccessDenied, match=r"certificate of .* is refused: .*foreign/ca\.pem"):
-            await travel(server.address, tls=foreign("vehicle-cav-1"))
-
-
-async def test_a_vehicles_certificate_makes_no_server(
-    certs: Files, serve: Any, travel: Any
-) -> None:
-    async with serve(tls=certs("vehicle-cav-2")) as server:
-        with pytest.raises(AccessDenied, match="is refused: "):
-            await travel(server.address, tls=certs("vehicle-cav-1"))
-
-
-async def test_plaintext_to_a_server_with_certificates_is_explained(
-    certs: Files, serve: Any, travel: Any
-) -> None:
-    async with serve(tls=certs("server")) as server:
-        with pytest.raises(AccessDenied, match="wants TLS; give --tls-cert"):
-            await travel(server.address, limits=AgentLimits(give_up_s=0.2))
-
-
-async def test_certificates_for_a_plaintext_server_are_explained(
-    certs: Files, serve: Any, travel: Any
-) -> None:
-    async with serve() as server:
-        with pytest.raises(AccessDenied, match="speaks plaintext"):
-            await travel(server.address, tls=certs("vehicle-cav-1"), limits=SOON_S)
+            await travel(server.address, tls=own)
 
 
 async def test_a_server_that_is_not_there_is_no_refusal(certs: Files, travel: Any) -> None:
@@ -178,7 +166,7 @@ async def test_a_server_takes_up_new_certificates_and_open_connections_go_on(
         write_certificates(tmp_path / "certs", issued, replace=True)
         assert (await travel(server.address, tls=certs("vehicle-cav-1"))).counts == {"acked": 6}
         with pytest.raises(RfedgeError):
-            await travel(server.address, tls=before, limits=SOON_S)
+            await travel(server.address, tls=before, limits=SOON)
         answer = await health_pb2_grpc.HealthStub(channel).Check(health)
         assert answer.status == health_pb2.HealthCheckResponse.SERVING
 
