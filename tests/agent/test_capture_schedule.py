@@ -1,6 +1,7 @@
 """When pictures are captured, on a clock that the test holds."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -11,6 +12,17 @@ from cav_agent.frames import Capture, EndReason, FrameResult, Outcome
 from rfcore.errors import InvalidInput, RejectReason, RfedgeError
 
 MakeCapture = Callable[..., Capture]
+End = Callable[..., None]
+
+
+@pytest.fixture
+def end(make_capture: MakeCapture) -> End:
+    """Return what ends pictures of a schedule."""
+
+    def run(schedule: Lockstep, *how: Any) -> None:
+        schedule.ended(FrameResult(make_capture(0), *how))
+
+    return run
 
 
 def test_realtime_captures_at_its_rate_and_does_not_drift() -> None:
@@ -44,66 +56,54 @@ def test_a_loop_begins_again() -> None:
     assert not schedule.finished
 
 
-def test_lockstep_waits_for_the_answer(make_capture: MakeCapture) -> None:
+def test_lockstep_waits_for_the_answer(end: End) -> None:
     schedule = Lockstep(2)
     assert schedule.next_capture(0.0) == 0
     assert schedule.next_capture(9.0) is None
-    schedule.ended(FrameResult(make_capture(0), Outcome.ACKED))
+    end(schedule, Outcome.ACKED)
     assert schedule.next_capture(9.0) == 1
-    schedule.ended(FrameResult(make_capture(1), Outcome.NACKED, RejectReason.CRC_MISMATCH))
+    end(schedule, Outcome.NACKED, RejectReason.CRC_MISMATCH)
     assert schedule.finished
 
 
-def test_lockstep_captures_a_lost_picture_again(make_capture: MakeCapture) -> None:
+def test_lockstep_captures_a_lost_picture_again(end: End) -> None:
     schedule = Lockstep(2)
     assert schedule.next_capture(0.0) == 0
-    schedule.ended(FrameResult(make_capture(0), Outcome.LOST, EndReason.STREAM_LOST))
+    end(schedule, Outcome.LOST, EndReason.STREAM_LOST)
     assert schedule.next_capture(1.0) == 0
 
 
-def test_lockstep_gives_up_a_picture_that_is_always_lost(make_capture: MakeCapture) -> None:
+def test_lockstep_gives_up_a_picture_that_is_always_lost(end: End) -> None:
     schedule = Lockstep(2)
     for _ in range(4):
         schedule.next_capture(0.0)
-        schedule.ended(
-            FrameResult(make_capture(0), Outcome.LOST, EndReason.NO_ANSWER, "within 5 s")
-        )
+        end(schedule, Outcome.LOST, EndReason.NO_ANSWER, "within 5 s")
     schedule.next_capture(0.0)
-    with pytest.raises(
-        RfedgeError, match=r"picture 000.png was lost 5 times: no_answer: within 5 s"
-    ):
-        schedule.ended(
-            FrameResult(make_capture(0), Outcome.LOST, EndReason.NO_ANSWER, "within 5 s")
-        )
+    with pytest.raises(RfedgeError, match=r"000.png was lost 5 times: no_answer: within 5 s"):
+        end(schedule, Outcome.LOST, EndReason.NO_ANSWER, "within 5 s")
 
 
-def test_lockstep_stops_at_a_picture_that_cannot_be_coded(make_capture: MakeCapture) -> None:
+def test_lockstep_stops_at_a_picture_that_cannot_be_coded(end: End) -> None:
     schedule = Lockstep(2)
     schedule.next_capture(0.0)
     with pytest.raises(RfedgeError, match=r"000.png could not be coded: not a readable picture"):
-        schedule.ended(
-            FrameResult(
-                make_capture(0), Outcome.DROPPED, EndReason.NOT_CODED, "not a readable picture"
-            )
-        )
+        end(schedule, Outcome.DROPPED, EndReason.NOT_CODED, "not a readable picture")
 
 
-def test_lockstep_does_not_give_up_a_picture_that_was_dropped_to_stop(
-    make_capture: MakeCapture,
-) -> None:
+def test_lockstep_does_not_give_up_a_picture_that_was_dropped_to_stop(end: End) -> None:
     schedule = Lockstep(2)
     for _ in range(4):
         schedule.next_capture(0.0)
-        schedule.ended(FrameResult(make_capture(0), Outcome.LOST, EndReason.NO_ANSWER))
+        end(schedule, Outcome.LOST, EndReason.NO_ANSWER)
     schedule.next_capture(0.0)
-    schedule.ended(FrameResult(make_capture(0), Outcome.DROPPED, EndReason.STOPPING))
+    end(schedule, Outcome.DROPPED, EndReason.STOPPING)
     assert not schedule.finished
 
 
-def test_lockstep_captures_a_picture_again_that_waited_too_long(make_capture: MakeCapture) -> None:
+def test_lockstep_captures_a_picture_again_that_waited_too_long(end: End) -> None:
     schedule = Lockstep(2)
     schedule.next_capture(0.0)
-    schedule.ended(FrameResult(make_capture(0), Outcome.DROPPED, EndReason.TOO_LATE))
+    end(schedule, Outcome.DROPPED, EndReason.TOO_LATE)
     assert schedule.next_capture(1.0) == 0
 
 
@@ -135,38 +135,30 @@ def test_a_rate_that_is_granted_later_is_kept_from_then_on() -> None:
     assert [i for i in then if i is not None] == [10, 14, 19, 24, 29, 34, 39]
 
 
-def ended(make_capture: MakeCapture, outcome: Outcome, reason: EndReason) -> FrameResult:
-    return FrameResult(make_capture(0), outcome, reason)
-
-
-def test_lockstep_of_a_rig_waits_for_every_camera(make_capture: MakeCapture) -> None:
+def test_lockstep_of_a_rig_waits_for_every_camera(end: End) -> None:
     schedule = Lockstep(2, cameras=3)
     assert schedule.next_capture(0.0) == 0
     for _ in range(2):
-        schedule.ended(ended(make_capture, Outcome.ACKED, EndReason.NONE))
+        end(schedule, Outcome.ACKED)
         assert schedule.next_capture(1.0) is None
-    schedule.ended(ended(make_capture, Outcome.ACKED, EndReason.NONE))
+    end(schedule, Outcome.ACKED)
     assert schedule.next_capture(2.0) == 1
 
 
-def test_lockstep_takes_an_instant_again_of_which_a_picture_was_lost(
-    make_capture: MakeCapture,
-) -> None:
+def test_lockstep_takes_an_instant_again_of_which_a_picture_was_lost(end: End) -> None:
     schedule = Lockstep(2, cameras=2)
     assert schedule.next_capture(0.0) == 0
-    schedule.ended(ended(make_capture, Outcome.LOST, EndReason.STREAM_LOST))
-    schedule.ended(ended(make_capture, Outcome.ACKED, EndReason.NONE))
+    end(schedule, Outcome.LOST, EndReason.STREAM_LOST)
+    end(schedule, Outcome.ACKED)
     assert schedule.next_capture(1.0) == 0
 
 
-def test_a_camera_whose_picture_cannot_be_coded_does_not_end_the_drive(
-    make_capture: MakeCapture,
-) -> None:
+def test_a_camera_whose_picture_cannot_be_coded_does_not_end_the_drive(end: End) -> None:
     schedule = Lockstep(2, cameras=2)
     assert schedule.next_capture(0.0) == 0
-    schedule.ended(ended(make_capture, Outcome.DROPPED, EndReason.NOT_CODED))
-    schedule.ended(ended(make_capture, Outcome.ACKED, EndReason.NONE))
+    end(schedule, Outcome.DROPPED, EndReason.NOT_CODED)
+    end(schedule, Outcome.ACKED)
     assert schedule.next_capture(1.0) == 1
-    schedule.ended(ended(make_capture, Outcome.DROPPED, EndReason.NOT_CODED))
+    end(schedule, Outcome.DROPPED, EndReason.NOT_CODED)
     with pytest.raises(RfedgeError, match="could not be coded"):
-        schedule.ended(ended(make_capture, Outcome.DROPPED, EndReason.NOT_CODED))
+        end(schedule, Outcome.DROPPED, EndReason.NOT_CODED)

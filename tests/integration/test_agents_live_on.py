@@ -5,13 +5,12 @@ import json
 import signal
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import grpc
-import pytest
 
 from live_server import until
 from rfcore.wire.conventions import STREAM_METHOD
@@ -82,20 +81,13 @@ async def agent_at(
 async def test_a_server_that_comes_back_with_another_field_is_followed(
     street: Any, tmp_path: Path
 ) -> None:
-    async with server_of(street.store, tmp_path) as address:
-        agent_here = agent_at(street, tmp_path, address)
-        agent = await agent_here.__aenter__()
-        try:
+    async with AsyncExitStack() as stack:
+        async with server_of(street.store, tmp_path) as address:
+            agent = await stack.enter_async_context(agent_at(street, tmp_path, address))
             await agent.goes_on()
-        except BaseException:
-            await agent_here.__aexit__(None, None, None)
-            raise
-    try:
-        async with server_of(street.other_store, tmp_path, address):
-            await agent.goes_on()
-            assert (tmp_path / "fields" / f"{street.other_id}.rff").exists()
-    finally:
-        await agent_here.__aexit__(None, None, None)
+        await stack.enter_async_context(server_of(street.other_store, tmp_path, address))
+        await agent.goes_on()
+        assert (tmp_path / "fields" / f"{street.other_id}.rff").exists()
 
 
 class OnceUnwilling(grpc.GenericRpcHandler):
@@ -130,23 +122,6 @@ async def test_a_failed_precondition_is_outlived_also_by_a_vehicle_that_only_sta
         await first.stop(None)
         async with server_of(street.store, tmp_path, address):
             await agent.goes_on()
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(180)
-async def test_a_server_that_is_away_for_30_s_is_waited_for(street: Any, tmp_path: Path) -> None:
-    agent_here = None
-    try:
-        async with server_of(street.store, tmp_path) as address:
-            agent_here = agent_at(street, tmp_path, address)
-            agent = await agent_here.__aenter__()
-            await agent.goes_on()
-        await asyncio.sleep(31.0)  # the absence is what is tested
-        async with server_of(street.store, tmp_path, address):
-            await agent.goes_on()
-    finally:
-        if agent_here is not None:
-            await agent_here.__aexit__(None, None, None)
 
 
 async def test_without_a_server_for_as_long_as_is_given_the_drive_ends(

@@ -25,7 +25,7 @@ from rfcore.native.yuv import field_view_from_view
 from rfcore.perception.composition import LivePicture
 from rfcore.perception.ground import FieldGround
 from rfcore.wire.conventions import CONSUMER_OPTIONS
-from rfcore.wire.messages import Ack, Frame, Hello, Nack
+from rfcore.wire.messages import Ack, Frame, Hello
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tile_manifest import VersionLabel
@@ -96,39 +96,6 @@ def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[LivePicture]:
 
     monkeypatch.setattr(rendering, "cut_out", noted)
     return pictures
-
-
-async def test_the_ground_of_a_picture_is_drawn_before_the_picture_is_there(
-    street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The picture is one that cannot be decoded, and somebody takes notices."""
-    drawn: list[Pose] = []
-    ahead_of = FieldGround.ahead_of
-
-    def noted(ground: FieldGround, camera: Camera) -> Any:
-        drawn.append(camera.world_from_cam)
-        return ahead_of(ground, camera)
-
-    monkeypatch.setattr(FieldGround, "ahead_of", noted)
-    here, there = (Pose((x_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)) for x_m in (0.5, 1.0))
-    async with serve() as server, raw_vehicle(server.address) as vehicle:
-        await vehicle.greet(as_vehicle(coded.hello, "alone", takes=False))
-        await vehicle.say(undecodable(bare_frame(street, coded.hello, here)))
-        assert isinstance(await vehicle.hear(), Nack)
-        async with raw_vehicle(server.address) as taker:
-            await taker.greet(as_vehicle(coded.hello, "taker", takes=True))
-            async with asyncio.timeout(20):
-                while server._twin.expect != server._notices._expect:
-                    await asyncio.sleep(0.001)
-                await vehicle.say(undecodable(bare_frame(street, coded.hello, there)))
-                assert isinstance(await vehicle.hear(), Nack)
-                while not drawn:
-                    await asyncio.sleep(0.001)
-    assert drawn == [there]
-
-
-def undecodable(frame: Frame) -> Frame:
-    return replace(frame, packet=replace(frame.packet, payload=b"no slice").sealed())
 
 
 async def test_what_one_vehicle_sees_another_is_told(

@@ -6,11 +6,9 @@ The only tests here that look at the clock: how fast a vehicle comes back is the
 import asyncio
 import json
 import shutil
-import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -19,12 +17,9 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from cav_agent.config import AgentConfig, PaceKind
-from cav_agent.vehicle import Vehicle
 from mec_server.config import ServerConfig
 from mec_server.server import EdgeServer
 from recorded import recorded
-from rfcore.codec.h264.config import CoderSettings
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.settings import MetricsSettings, TransportSettings
 
@@ -76,56 +71,6 @@ def acked_at_s(report: Path) -> list[float]:
         for line in lines
         if line["result"] == "acked"
     ]
-
-
-async def port_opens(host: str, port: int) -> float:
-    """Return the second at which a connection to the port succeeds."""
-    while True:
-        try:
-            _, writer = await asyncio.open_connection(host, port)
-        except OSError:
-            await asyncio.sleep(0.005)
-        else:
-            opened_s = time.time()
-            writer.close()
-            return opened_s
-
-
-async def test_a_vehicle_goes_on_within_a_second_of_its_killed_server_coming_back(
-    street: Any, tmp_path: Path
-) -> None:
-    ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
-    async with server_process(street, ready, "--listen", "127.0.0.1:0") as first:
-        address = ready.read_text().strip()
-        config = AgentConfig(
-            address,
-            street.drive,
-            street.store,
-            pace=PaceKind.LOCKSTEP,
-            loop=True,
-            field=street.field_id,
-            coding=CoderSettings(effort="fast"),
-            report=report,
-        )
-        vehicle = Vehicle(config)
-        driving = asyncio.create_task(vehicle.run())
-        await appears(lambda: report.exists() and len(acked_at_s(report)) >= 3)
-        first.send_signal(signal.SIGKILL)
-        await first.wait()
-    host, _, port = address.rpartition(":")
-    opening = asyncio.create_task(port_opens(host, int(port)))
-    before = len(acked_at_s(report))
-    async with server_process(street, ready, "--listen", address):
-        opened_s = await opening
-        await appears(lambda: len(acked_at_s(report)) > before)
-        back_s = acked_at_s(report)[before] - opened_s
-        vehicle.stop()
-        counts = await driving
-        lost = vehicle.registry.get_sample_value("rfedge_agent_connections_lost_total")
-    print(f"back after {back_s:.3f} s")
-    assert back_s <= 1.0
-    assert lost == 1
-    assert counts["nacked"] == counts["dropped"] == 0
 
 
 async def test_a_drive_ends_with_exit_0_and_a_server_told_to_stop_does_too(

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import structlog
-from prometheus_client import CollectorRegistry
 
 from mec_server.config import DecoderKind, ServerConfig
 from mec_server.decoding import decoders as decoder_kinds
@@ -17,7 +16,6 @@ from mec_server.decoding import process
 from mec_server.decoding.child import LIMITS
 from mec_server.decoding.decoders import ChildDecoder, DecoderPool, Decoders, decoder_program
 from mec_server.decoding.process import DecoderLost, DecoderProcess, ForkServer, LossCause
-from mec_server.metrics import ServerMetrics
 from mec_server.server import EdgeServer
 from rfcore.codec.h264.ffmpeg import EncoderOptions, H264Decoder, PictureKind, encode_pictures
 from rfcore.confinement import start
@@ -319,22 +317,6 @@ def test_a_spare_that_cannot_be_started_is_reported_though_nobody_waits_for_it()
     pool.close()
     assert failures
     assert all("no_such_module" in str(error) for error in failures)
-
-
-def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
-    registry = CollectorRegistry()
-    count_loss = ServerMetrics(registry).count_lost_decoder
-    made = Decoders(DecoderKind.CHILD, count_loss=count_loss, start_failed=unexpected)
-    made.start()
-    decoder: Any = made.open(SIZE_PX)
-    os.kill(process_of(decoder), signal.SIGSEGV)
-    with pytest.raises(CodecError, match="SIGSEGV"):
-        decoder.decode(units[0])
-    decoder.close()
-    made.close()
-    name = "rfedge_server_decoders_lost_total"
-    assert registry.get_sample_value(name, {"cause": "signal"}) == 1
-    assert registry.get_sample_value(name, {"cause": "timeout"}) == 0
 
 
 async def test_the_kind_in_force_is_in_the_metrics(tmp_path: Path) -> None:

@@ -139,14 +139,6 @@ async def test_what_was_returned_or_raised_reaches_the_loop_that_asked(
     assert [type(o) for o in outcomes if isinstance(o, Exception)] == [ZeroDivisionError]
 
 
-async def test_one_worker_does_work_in_the_order_of_asking(make_workers: MakeWorkers) -> None:
-    workers, order = make_workers(1), list[int]()
-    for number in range(100):
-        workers.submit("cav-1", lambda number=number: order.append(number), lambda _: None)
-    await result_of(workers, lambda: None)
-    assert order == list(range(100))
-
-
 async def test_every_thread_of_all_workers_begins_at_the_same_time(
     make_workers: MakeWorkers,
 ) -> None:
@@ -349,28 +341,3 @@ async def test_a_deadline_that_has_come_sets_the_event(event: asyncio.Event) -> 
     timer.restart(asyncio.get_running_loop().time() - 1.0)
     async with asyncio.timeout(10.0):
         await event.wait()
-
-
-async def test_a_later_deadline_keeps_the_timer_and_an_earlier_one_replaces_it(
-    event: asyncio.Event, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    loop = asyncio.get_running_loop()
-    armed: list[float] = []
-    call_at = loop.call_at
-
-    def counting(when: float, ring: object, *args: object) -> asyncio.TimerHandle:
-        armed.append(when)
-        return call_at(when, ring, *args)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(loop, "call_at", counting)
-    now = loop.time()
-    timer = LazyTimer(event)
-    for later in range(100):
-        timer.restart(now + 60.0 + later)
-    timer.restart(now + 30.0)
-    assert armed == [now + 60.0, now + 30.0]
-    timer.restart(None)
-    timer.restart(now + 50.0)
-    assert armed[-1] == now + 50.0
-    timer.cancel()
-    assert not event.is_set()

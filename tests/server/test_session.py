@@ -253,23 +253,6 @@ def test_a_new_epoch_starts_afresh_and_the_old_one_is_over(
     ]  # fmt: skip
 
 
-def test_a_frame_that_failed_in_a_new_epoch_is_answered_once(
-    session: ServerSession, make_frame: MakeFrame
-) -> None:
-    broken = with_wrong_crc(make_frame(0, epoch=4))
-    frames = [make_frame(0), broken, make_frame(1, epoch=4)]
-    assert deliver(session, frames) == [("ack", 0), ("crc_mismatch", 0), ("ack", 1)]
-
-
-def test_a_flipped_epoch_does_not_carry_the_session_away(
-    session: ServerSession, make_frame: MakeFrame
-) -> None:
-    frames = [make_frame(0), make_frame(1, epoch=1 << 30), make_frame(2)]
-    assert deliver(session, frames) == [
-        ("ack", 0), ("invalid_argument", 1), ("sequence_gap", 1), ("ack", 2),
-    ]  # fmt: skip
-
-
 def test_a_damaged_frame_is_refused_before_a_worker_renders_and_can_be_logged(
     session: ServerSession, make_frame: MakeFrame
 ) -> None:
@@ -349,15 +332,6 @@ def test_an_unreadable_message_starves_no_camera(session: ServerSession) -> None
 
 
 # --- credits, order, work
-
-
-def test_credit_grows_by_what_was_answered_lost_frames_included(
-    session: ServerSession, make_frame: MakeFrame
-) -> None:
-    decoder = ReferenceDecoder()
-    session.receive(make_frame(3), 1.0)
-    decoder.run(session, 1.0)
-    assert session.messages_to_send(1.0)[-1] == Credit("front", 2 + 4)
 
 
 def test_frames_beyond_the_window_are_refused_as_overload(
