@@ -1,11 +1,20 @@
-"""What the page is told of fields and cameras."""
+"""What the page is told of fields, cameras and tiles, and how readers of the board hear of it."""
 
+import json
+import struct
 from dataclasses import replace
 from typing import Any
 
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
 from rfcore.camera import TileOrigin
+from rfcore.errors import InvalidInput
 from rfcore.field import FieldMetadata, SplatField
-from rfedge.twin.scene import Board, PlacedField, Reader, TwinScene
+from rfcore.wire.tiles import LearntLight, Tile, TileLight, learnt_message, learnt_of
+from rfedge.twin.scene import Board, Message, PlacedField, Reader, TwinScene
+from rfedge.twin.server_source import tile_rows
 from wall_scene import seen, wall_field
 
 
@@ -68,3 +77,126 @@ def test_a_camera_that_left_is_not_shown_to_those_who_come_later(wall: SplatFiel
 
 def test_splats_are_made_for_the_page(wall: SplatField) -> None:
     assert PlacedField.of(wall, "a").spz[:2] == b"\x1f\x8b"
+
+
+# --- the operator's table: which lights a tile has, and what its server learnt of them
+
+
+OWN, DUSK, OLD = "a" * 64, "b" * 64, "c" * 64
+TILE = Tile("west", OWN, 3, lights=(TileLight("h18", DUSK, 4, OWN, 2, 18.25),))
+LEARNT = LearntLight("west", "h18", DUSK, 2, 1_767_290_400_000, 0.53)
+NOTHING_LEARNT = {"learnt_ms": None, "saved_ratio": None, "withdrawn": False}
+
+
+def test_each_light_has_a_row_with_what_was_learnt_of_it() -> None:
+    own, dusk = tile_rows([TILE], [LEARNT])
+    assert own == {
+        "tile": "west", "light": "", "version": 3, "time_of_day_h": None, "passes": 0,
+        **NOTHING_LEARNT,
+    }  # fmt: skip
+    assert dusk == {
+        "tile": "west", "light": "h18", "version": 4, "time_of_day_h": 18.25, "passes": 2,
+        "learnt_ms": 1_767_290_400_000, "saved_ratio": 0.53, "withdrawn": False,
+    }  # fmt: skip
+
+
+def test_what_was_withdrawn_saves_nothing() -> None:
+    withdrawn = replace(LEARNT, light="", field_id=OLD, withdrawn=True)
+    own, dusk = tile_rows([TILE], [withdrawn])
+    assert (own["saved_ratio"], own["withdrawn"], own["passes"]) == (0.0, True, 0)
+    assert dusk["learnt_ms"] is None
+
+
+def test_a_version_published_by_hand_since_was_not_learnt() -> None:
+    _, dusk = tile_rows([TILE], [replace(LEARNT, field_id=OLD)])
+    assert {name: dusk[name] for name in NOTHING_LEARNT} == NOTHING_LEARNT
+    assert dusk["passes"] == 2
+
+
+def test_the_table_is_sent_again_only_when_it_changes() -> None:
+    board = Board()
+    reader, scene = board.read(lambda: None), TwinScene(board)
+    sent = []
+    for saved_ratio in (0.53, 0.53, 0.6):
+        scene.show_tiles(tile_rows([TILE], [replace(LEARNT, saved_ratio=saved_ratio)]), 0.0)
+        message = reader.take()
+        sent.append(None if message is None else message.header["rows"][1]["saved_ratio"])
+    assert sent == [0.53, None, 0.6]
+
+
+def test_what_was_learnt_survives_the_wire_and_is_checked() -> None:
+    assert learnt_of(learnt_message(LEARNT)) == LEARNT
+    message = learnt_message(LEARNT)
+    message.saved_ratio = float("nan")
+    with pytest.raises(InvalidInput, match="saved_ratio"):
+        learnt_of(message)
+
+
+# --- every reader ends with the newest message of every key, however slowly it reads
+
+
+KEYS = st.sampled_from("abc")
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("post"), KEYS, st.integers(0, 99)),
+        st.tuples(st.just("clear"), KEYS, st.just(-1)),
+        st.tuples(st.just("take"), st.just(""), st.just(0)),
+        st.tuples(st.just("join"), st.just(""), st.just(0)),
+    ),
+    max_size=40,
+)
+
+
+def message(key: str, value: int) -> Message:
+    return Message({"key": key, "value": value}, 0.0)
+
+
+@given(STEPS)
+def test_a_reader_ends_with_the_newest_of_every_key(steps: list[tuple[str, str, int]]) -> None:
+    board = Board()
+    shown: dict[str, int] = {}
+    readers = [(board.read(lambda: None), dict[str, int]())]
+    for step, key, value in steps:
+        if step == "post":
+            board.post(key, message(key, value))
+            shown[key] = value
+        elif step == "clear":
+            board.clear(key, message(key, value))
+            shown.pop(key, None)
+        elif step == "join":
+            readers.append((board.read(lambda: None), {}))
+        elif (taken := readers[0][0].take()) is not None:
+            readers[0][1][taken.header["key"]] = taken.header["value"]
+    for reader, known in readers:
+        while (taken := reader.take()) is not None:
+            known[taken.header["key"]] = taken.header["value"]
+        assert {key: value for key, value in known.items() if value >= 0} == shown
+
+
+def test_a_reader_is_woken_counts_what_it_missed_and_holds_one_message_a_key() -> None:
+    board, calls = Board(), []
+    reader = board.read(lambda: calls.append(1))
+    for value in range(5):
+        board.post("a", message("a", value))
+    assert len(calls) == 5
+    assert reader.missed == 4
+    taken = reader.take()
+    assert taken is not None
+    assert taken.header["value"] == 4
+    assert reader.take() is None
+
+
+def test_one_that_left_is_told_nothing() -> None:
+    board, calls = Board(), []
+    reader = board.read(lambda: calls.append(1))
+    board.leave(reader)
+    board.post("a", message("a", 1))
+    assert not calls
+
+
+def test_a_message_says_how_long_its_parts_are_and_how_long_it_waited() -> None:
+    data = Message({"kind": "x"}, 2.0, (b"abc", b"", b"de")).encode(2.5)
+    (length,) = struct.unpack_from("<I", data)
+    header = json.loads(data[4 : 4 + length])
+    assert header == {"kind": "x", "held_ms": 500.0, "part_bytes": [3, 0, 2]}
+    assert data[4 + length :] == b"abcde"
