@@ -114,6 +114,7 @@ async def test_an_agent_told_to_stop_finishes_its_frame_and_ends_cleanly(
     [
         ({"--server": "192.0.2.1:50051"}, "not encrypted; give --allow-insecure"),
         ({"--drive": "/nonexistent"}, "/nonexistent"),
+        ({"--report": "/missing/report.jsonl"}, "/missing/report.jsonl"),
     ],
 )
 async def test_a_users_mistake_is_one_line_and_exit_2(

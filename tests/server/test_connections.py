@@ -42,13 +42,6 @@ from mec_server.ledger.budgets import Limit
 from mec_server.server import EdgeServer
 
 
-@pytest.fixture
-def listener() -> Iterator[socket.socket]:
-    with closing(socket.create_server(("127.0.0.1", 0))) as made:
-        made.settimeout(10)
-        yield made
-
-
 def connect(stack: ExitStack, port: int, source: str = "127.0.0.1") -> socket.socket:
     """Return the near end of a new connection from ``source``."""
     near = socket.create_connection(("127.0.0.1", port), 10, (source, 0))
@@ -69,13 +62,6 @@ def is_closed(near: socket.socket) -> bool:
         return False
     except ConnectionError:
         return True
-
-
-def watching(listener: socket.socket, of_address: int, of_identity: int) -> Connections:
-    """Return what looks after the connections to a listener."""
-    made = Connections(of_address, of_identity)
-    made.listen(listener.getsockname()[1])
-    return made
 
 
 class Pairs:
@@ -100,10 +86,30 @@ class Pairs:
                 sent -= len(self.fars[number].recv(sent))
 
 
+class Port:
+    """A port that is listened on, and the connections to it."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.stack = stack
+        self.listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        self.listener.settimeout(10)
+        self.number: int = self.listener.getsockname()[1]
+
+    def watched(self, of_address: int = 0, of_identity: int = 0) -> Connections:
+        """Return what looks after the connections."""
+        made = Connections(of_address, of_identity)
+        made.listen(self.number)
+        return made
+
+    def pairs(self, count: int, source: str = "127.0.0.1") -> Pairs:
+        """Return new connections from an address."""
+        return Pairs(self.stack, self.listener, source, count)
+
+
 @pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as made:
-        yield made
+def port() -> Iterator[Port]:
+    with ExitStack() as stack:
+        yield Port(stack)
 
 
 @pytest.mark.parametrize(
@@ -120,35 +126,29 @@ def test_an_ipv6_site_counts_as_one_address(address: str, source: str) -> None:
     assert source_of(address) == source
 
 
-def test_the_newest_beyond_the_cap_are_cut_and_another_address_keeps_its_own(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    connections = watching(listener, 2, 0)
-    first = Pairs(stack, listener, "127.0.0.1", 2)
+def test_the_newest_beyond_the_cap_are_cut_and_another_address_keeps_its_own(port: Port) -> None:
+    connections = port.watched(2)
+    first = port.pairs(2)
     assert not connections.sweep(0.0), "as many as there may be"
-    beyond = Pairs(stack, listener, "127.0.0.1", 3)
-    modest = Pairs(stack, listener, "127.0.0.2", 1)
+    beyond = port.pairs(3)
+    modest = port.pairs(1, "127.0.0.2")
     (cut,) = connections.sweep(0.25)
     assert cut == ClosedConnections("127.0.0.1", Limit.ADDRESS_CONNECTIONS, 3, barred=False)
     assert all(map(is_closed, beyond.nears))
     assert not any(map(is_closed, (*first.nears, *modest.nears)))
 
 
-def test_sweeping_leaves_no_descriptor_behind_and_touches_no_other_port(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    pairs = Pairs(stack, listener, "127.0.0.1", 3)
+def test_sweeping_leaves_no_descriptor_behind_and_touches_no_other_port(port: Port) -> None:
+    pairs = port.pairs(3)
     before = len(descriptors())
     assert not Connections(1, 0).sweep(0.0)  # of no port
     assert len(descriptors()) == before
     assert not any(map(is_closed, pairs.nears))
 
 
-def test_bytes_that_become_no_message_end_a_connection_and_messages_do_not(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    connections = watching(listener, 0, 0)
-    pairs = Pairs(stack, listener, "127.0.0.1", 3)
+def test_bytes_that_become_no_message_end_a_connection_and_messages_do_not(port: Port) -> None:
+    connections = port.watched()
+    pairs = port.pairs(3)
     connections.claim(pairs.peers[2], "sender")
     connections.sweep(0.0)
     pairs.send(2, UNEXPLAINED_BYTES * 3 // 4)
@@ -162,11 +162,9 @@ def test_bytes_that_become_no_message_end_a_connection_and_messages_do_not(
     assert [is_closed(near) for near in pairs.nears] == [False, False, True]
 
 
-def test_a_connection_without_a_call_is_ended_for_less(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    connections = watching(listener, 0, 0)
-    pairs = Pairs(stack, listener, "127.0.0.1", 3)
+def test_a_connection_without_a_call_is_ended_for_less(port: Port) -> None:
+    connections = port.watched()
+    pairs = port.pairs(3)
     connections.claim(pairs.peers[0], "called")
     connections.sweep(0.0)
     pairs.send(0, 2 * UNCALLED_BYTES)
@@ -177,11 +175,9 @@ def test_a_connection_without_a_call_is_ended_for_less(
     assert [is_closed(near) for near in pairs.nears] == [False, False, True]
 
 
-def test_a_little_beside_the_messages_is_forgotten_with_time(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    connections = watching(listener, 0, 0)
-    pairs = Pairs(stack, listener, "127.0.0.1", 1)
+def test_a_little_beside_the_messages_is_forgotten_with_time(port: Port) -> None:
+    connections = port.watched()
+    pairs = port.pairs(1)
     connections.claim(pairs.peers[0], "sender")
     connections.sweep(0.0)
     for minute in range(1, 6):
@@ -192,22 +188,18 @@ def test_a_little_beside_the_messages_is_forgotten_with_time(
     assert connections.sweep(301.0)
 
 
-def test_a_message_explains_nothing_that_comes_later(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    connections = watching(listener, 0, 0)
-    pairs = Pairs(stack, listener, "127.0.0.1", 1)
+def test_a_message_explains_nothing_that_comes_later(port: Port) -> None:
+    connections = port.watched()
+    pairs = port.pairs(1)
     connections.explain(pairs.peers[0], 100 * UNEXPLAINED_BYTES)  # compressed, it was short
     assert not connections.sweep(0.0)
     pairs.send(0, 2 * UNEXPLAINED_BYTES)
     assert connections.sweep(0.25)
 
 
-def test_calls_that_a_budget_refuses_end_a_connection(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    connections = watching(listener, 0, 0)
-    pairs = Pairs(stack, listener, "127.0.0.1", 2)
+def test_calls_that_a_budget_refuses_end_a_connection(port: Port) -> None:
+    connections = port.watched()
+    pairs = port.pairs(2)
     connections.sweep(0.0)
     for _ in range(UNEXPLAINED_BYTES // REFUSED_CALL_BYTES):
         for peer in pairs.peers:
@@ -220,12 +212,10 @@ def test_calls_that_a_budget_refuses_end_a_connection(
     assert [is_closed(near) for near in pairs.nears] == [True, False]
 
 
-def test_an_identity_holds_so_many_connections_and_a_proxy_as_many_as_it_needs(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    connections = watching(listener, 0, 2)
-    greedy, modest = (Pairs(stack, listener, "127.0.0.1", count) for count in (4, 2))
-    proxy = Pairs(stack, listener, "127.0.0.3", 4)
+def test_an_identity_holds_so_many_connections_and_a_proxy_as_many_as_it_needs(port: Port) -> None:
+    connections = port.watched(0, 2)
+    greedy, modest = (port.pairs(count) for count in (4, 2))
+    proxy = port.pairs(4, "127.0.0.3")
     for name, pairs in (("greedy", greedy), ("modest", modest)):
         for peer in pairs.peers:
             connections.claim(peer, name)
@@ -238,12 +228,10 @@ def test_an_identity_holds_so_many_connections_and_a_proxy_as_many_as_it_needs(
     assert not any(is_closed(near) for near in (*modest.nears, *proxy.nears))
 
 
-def test_what_a_connection_sent_before_it_was_ended_is_not_read_any_more(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    pairs = Pairs(stack, listener, "127.0.0.1", 1)
+def test_what_a_connection_sent_before_it_was_ended_is_not_read_any_more(port: Port) -> None:
+    pairs = port.pairs(1)
     pairs.nears[0].send(bytes(100_000))
-    watching(listener, 0, 0).offend(pairs.peers[0], Limit.HEADER_BYTES, 0.0)
+    port.watched().offend(pairs.peers[0], Limit.HEADER_BYTES, 0.0)
     assert pairs.fars[0].recv(1 << 20) == b""
     assert is_closed(pairs.nears[0])
 
@@ -256,32 +244,29 @@ def can_connect(port: int, source: str, host: str = "127.0.0.1") -> bool:
     return True
 
 
-def test_an_address_that_offended_is_not_answered_for_a_while_and_others_are(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    port, connections = listener.getsockname()[1], watching(listener, 0, 0)
-    guilty = Pairs(stack, listener, "127.0.0.2", 1)
-    beside = Pairs(stack, listener, "127.0.0.2", 1)
+def test_an_address_that_offended_is_not_answered_for_a_while_and_others_are(port: Port) -> None:
+    connections = port.watched()
+    guilty = port.pairs(1, "127.0.0.2")
+    beside = port.pairs(1, "127.0.0.2")
     connections.sweep(0.0)
     connections.offend(guilty.peers[0], Limit.HEADER_BYTES, 0.0)
     cuts = connections.sweep(0.25)
     assert cuts == [ClosedConnections("127.0.0.2", Limit.HEADER_BYTES, 1, barred=True)]
     assert not connections.sweep(0.5), "told once"
-    assert not can_connect(port, "127.0.0.2")
-    assert can_connect(port, "127.0.0.1")
+    assert not can_connect(port.number, "127.0.0.2")
+    assert can_connect(port.number, "127.0.0.1")
     beside.send(0, 10_000)  # what was there before goes on
     assert not is_closed(beside.nears[0])
     connections.sweep(0.5 + BARRED_S)
-    assert can_connect(port, "127.0.0.2")
+    assert can_connect(port.number, "127.0.0.2")
 
 
-def test_as_many_addresses_as_there_may_be_are_barred_at_once(listener: socket.socket) -> None:
-    port = listener.getsockname()[1]
-    bar(listener, [f"192.0.2.{i}" for i in range(MOST_BARRED - 1)] + ["127.0.0.9"])
-    assert not can_connect(port, "127.0.0.9")
-    assert can_connect(port, "127.0.0.8")
-    bar(listener, [f"2001:db8:{i:x}::/64" for i in range(MOST_BARRED)])
-    assert can_connect(port, "127.0.0.9")
+def test_as_many_addresses_as_there_may_be_are_barred_at_once(port: Port) -> None:
+    bar(port.listener, [f"192.0.2.{i}" for i in range(MOST_BARRED - 1)] + ["127.0.0.9"])
+    assert not can_connect(port.number, "127.0.0.9")
+    assert can_connect(port.number, "127.0.0.8")
+    bar(port.listener, [f"2001:db8:{i:x}::/64" for i in range(MOST_BARRED)])
+    assert can_connect(port.number, "127.0.0.9")
 
 
 @pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="needs IPv6")
@@ -338,15 +323,13 @@ def is_ready(listener: socket.socket, within_s: float = 0.0) -> bool:
     return bool(select.select([listener], [], [], within_s)[0])
 
 
-def test_a_connection_is_accepted_when_it_says_something(
-    listener: socket.socket, stack: ExitStack
-) -> None:
-    port = listener.getsockname()[1]
-    connect(stack, port)
+def test_a_connection_is_accepted_when_it_says_something(port: Port) -> None:
+    stack, listener = port.stack, port.listener
+    connect(stack, port.number)
     assert is_ready(listener)
     stack.enter_context(listener.accept()[0])
-    assert keep_silent_out(port) == 1
-    silent, speaking = connect(stack, port), connect(stack, port)
+    assert keep_silent_out(port.number) == 1
+    silent, speaking = connect(stack, port.number), connect(stack, port.number)
     assert not is_ready(listener)
     speaking.send(b"x")
     assert is_ready(listener, 10)
