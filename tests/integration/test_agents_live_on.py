@@ -4,8 +4,8 @@ import asyncio
 import json
 import signal
 import sys
-from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import grpc
 
 from live_server import until
 from rfcore.wire.conventions import STREAM_METHOD
+from rfedge.processes import service
 
 
 @dataclass
@@ -53,16 +54,13 @@ async def running_command(log: Path, *arguments: object) -> AsyncIterator[Any]:
         await process.wait()
 
 
-@asynccontextmanager
-async def server_of(store: Path, folder: Path, listen: str = "127.0.0.1:0") -> AsyncIterator[str]:
-    """Run a server as a process of its own; yield its address."""
-    ready, log = folder / "ready", folder / "server.log"
-    ready.unlink(missing_ok=True)
-    options = ("--fields", store, "--listen", listen, "--ready-file", ready)
-    async with running_command(log, "-m", "mec_server", *options) as process:
-        await until(lambda: ready.exists() or process.returncode is not None)
-        assert process.returncode is None, log.read_text()
-        yield ready.read_text().strip()
+@contextmanager
+def server_of(store: Path, folder: Path, listen: str = "127.0.0.1:0") -> Iterator[str]:
+    """Run a server as a process of its own, and kill it; yield its address."""
+    command = [sys.executable, "-m", "mec_server", "--fields", str(store), "--listen", listen]
+    with service("mec-server", command, folder) as running:
+        yield running.address
+        running.process.kill()
 
 
 @asynccontextmanager
@@ -82,10 +80,10 @@ async def test_a_server_that_comes_back_with_another_field_is_followed(
     street: Any, tmp_path: Path
 ) -> None:
     async with AsyncExitStack() as stack:
-        async with server_of(street.store, tmp_path) as address:
+        with server_of(street.store, tmp_path) as address:
             agent = await stack.enter_async_context(agent_at(street, tmp_path, address))
             await agent.goes_on()
-        await stack.enter_async_context(server_of(street.other_store, tmp_path, address))
+        stack.enter_context(server_of(street.other_store, tmp_path, address))
         await agent.goes_on()
         assert (tmp_path / "fields" / f"{street.other_id}.rff").exists()
 
@@ -120,7 +118,7 @@ async def test_a_failed_precondition_is_outlived_also_by_a_vehicle_that_only_sta
     async with agent_at(street, tmp_path, address, *stored) as agent:
         await until(lambda: unwilling.refused >= 2)
         await first.stop(None)
-        async with server_of(street.store, tmp_path, address):
+        with server_of(street.store, tmp_path, address):
             await agent.goes_on()
 
 

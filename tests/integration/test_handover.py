@@ -7,8 +7,8 @@ the wire are not the same numbers. Late is a picture that was dropped or lost, o
 import asyncio
 import itertools
 import subprocess
-from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,7 +32,7 @@ from rfcore.wire.twin import (
     TwinPicture,
 )
 from rfcore.wire.twin_client import AsyncTwinClient
-from rfedge.processes import command_of
+from rfedge.processes import command_of, service
 
 BORDER_M = 0.25
 """The drive is at 0.0, 0.1 ... 0.5 m east: pictures 0 to 2 belong to the west."""
@@ -46,7 +46,7 @@ EVERYWHERE = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
 class Roadside:
     """A server process, where it listens and where its pictures go."""
 
-    process: asyncio.subprocess.Process
+    process: subprocess.Popen[bytes]
     address: str
     saved: Path
 
@@ -64,36 +64,19 @@ def moved(field: SplatField, origin: TileOrigin) -> SplatField:
 
 
 @pytest.fixture
-async def roadside(street: Any, tmp_path: Path) -> AsyncIterator[Any]:
-    """Return a coroutine that starts a server for one tile, as a process."""
-    async with AsyncExitStack() as stack:
+def roadside(street: Any, tmp_path: Path) -> Iterator[Callable[..., Roadside]]:
+    """Return what starts a server for one tile, as a process."""
+    with ExitStack() as stack:
 
-        @asynccontextmanager
-        async def run(name: str, ground: Ground, origin: TileOrigin) -> AsyncIterator[Roadside]:
-            folder = tmp_path / name
+        def start(name: str, ground: Ground, *origin_m: float) -> Roadside:
+            folder, archive, saved = (tmp_path / f"{name}{end}" for end in ("", ".rff", "-saved"))
             folder.mkdir()
-            save_field(moved(street.field, origin), tmp_path / f"{name}.rff")
-            publish(
-                folder, name, tmp_path / f"{name}.rff", ground, datetime(2026, 1, 1, tzinfo=UTC)
-            )
-            ready, saved = tmp_path / f"{name}.ready", tmp_path / f"{name}-saved"
-            process = await asyncio.create_subprocess_exec(
-                *command_of("mec-server"), "--fields", str(folder), "--listen", "127.0.0.1:0",
-                "--ready-file", str(ready), "--record", str(saved), stderr=subprocess.DEVNULL,
-            )  # fmt: skip
-            try:
-                async with asyncio.timeout(60):
-                    while not ready.exists():
-                        assert process.returncode is None
-                        await asyncio.sleep(0.05)
-                yield Roadside(process, ready.read_text().strip(), saved)
-            finally:
-                if process.returncode is None:
-                    process.kill()
-                await process.wait()
-
-        async def start(name: str, ground: Ground, *origin_m: float) -> Roadside:
-            return await stack.enter_async_context(run(name, ground, TileOrigin(*origin_m)))
+            save_field(moved(street.field, TileOrigin(*origin_m)), archive)
+            publish(folder, name, archive, ground, datetime(2026, 1, 1, tzinfo=UTC))
+            command = [*command_of("mec-server"), "--fields", str(folder), "--record", str(saved)]
+            running = service(name, [*command, "--listen", "127.0.0.1:0"], tmp_path)
+            server = stack.enter_context(running)
+            return Roadside(server.process, server.address, saved)
 
         yield start
 
@@ -118,8 +101,8 @@ async def test_a_vehicle_crosses_without_a_late_picture_or_a_keyframe(
     roadside: Any, vehicle: Any, tmp_path: Path
 ) -> None:
     """A server that is slow because its machine is busy must not count as one that stalls."""
-    a = await roadside("west", WEST, 0.0)
-    b = await roadside("east", EAST, 2.0, -1.0, 0.5)
+    a = roadside("west", WEST, 0.0)
+    b = roadside("east", EAST, 2.0, -1.0, 0.5)
     at_a: list[TwinPicture | Departure] = []
     at_b: list[TwinPicture | Departure] = []
     watching = [
@@ -155,8 +138,8 @@ async def test_a_vehicle_crosses_without_a_late_picture_or_a_keyframe(
 async def test_a_vehicle_goes_to_the_neighbour_when_its_server_is_killed(
     roadside: Any, vehicle: Any, tmp_path: Path
 ) -> None:
-    a = await roadside("west", EVERYWHERE, 0.0)
-    b = await roadside("east", replace(EAST, margin_m=5.0), 2.0)
+    a = roadside("west", EVERYWHERE, 0.0)
+    b = roadside("east", replace(EAST, margin_m=5.0), 2.0)
     async with vehicle(
         a.address, neighbours=(b.address,), fields=tmp_path / "mine",
         pace=PaceKind.REALTIME, rate=10.0, loop=True,
@@ -174,8 +157,8 @@ async def test_without_a_neighbour_in_reach_the_newest_picture_waits_for_the_ser
     roadside: Any, vehicle: Any, tmp_path: Path
 ) -> None:
     """The server of the east is not there: pictures of the west arrive, those of the east wait."""
-    a = await roadside("west", replace(WEST, margin_m=0.0), 0.0)
-    b = await roadside("east", EAST, 2.0)
+    a = roadside("west", replace(WEST, margin_m=0.0), 0.0)
+    b = roadside("east", EAST, 2.0)
     async with vehicle(
         a.address, neighbours=(b.address,), fields=tmp_path / "mine",
         pace=PaceKind.REALTIME, rate=10.0, loop=True,

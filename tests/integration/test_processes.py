@@ -1,7 +1,4 @@
-"""The commands as processes: signals, crashes, and what they load.
-
-The only tests here that look at the clock: how fast a vehicle comes back is the requirement.
-"""
+"""The commands as processes: signals, mistakes, ports, and what they load."""
 
 import asyncio
 import json
@@ -9,19 +6,20 @@ import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from structlog.testing import capture_logs
 
+from live_server import until
 from mec_server.config import ServerConfig
 from mec_server.server import EdgeServer
 from recorded import recorded
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.settings import MetricsSettings, TransportSettings
+from rfedge.processes import Service, service
 
 Process = asyncio.subprocess.Process
 
@@ -32,27 +30,10 @@ async def start(module: str, *arguments: str) -> Process:
     )
 
 
-async def appears(condition: Callable[[], Any], process: Process | None = None) -> Any:
-    """Return the first true value of ``condition``; the test's timeout bounds the wait."""
-    while not (value := condition()):
-        assert process is None or process.returncode is None, await process.stderr.read()
-        await asyncio.sleep(0.005)
-    return value
-
-
-@asynccontextmanager
-async def server_process(street: Any, ready: Path, *more: str) -> AsyncIterator[Process]:
-    ready.unlink(missing_ok=True)
-    process = await start(
-        "mec_server", "--fields", str(street.store), "--ready-file", str(ready), *more
-    )
-    try:
-        await appears(ready.exists, process)
-        yield process
-    finally:
-        if process.returncode is None:
-            process.kill()
-        await process.communicate()
+def server_process(street: Any, folder: Path, *more: str) -> AbstractContextManager[Service]:
+    """Run a server as a process of its own."""
+    command = [sys.executable, "-m", "mec_server", "--fields", str(street.store), *more]
+    return service("mec-server", [*command, "--listen", "127.0.0.1:0"], folder)
 
 
 def agent_arguments(street: Any, address: str, report: Path) -> list[str]:
@@ -63,50 +44,43 @@ def agent_arguments(street: Any, address: str, report: Path) -> list[str]:
     return [*options, "--allow-recording"]
 
 
-def acked_at_s(report: Path) -> list[float]:
-    """Return when each acknowledged picture was, in seconds of the Unix epoch."""
-    lines = [json.loads(line) for line in report.read_text().splitlines()]
+def results(report: Path) -> list[str]:
+    """Return how each picture ended so far."""
+    text = report.read_text() if report.exists() else ""
     return [
-        line["capture_time_ns"] / 1e9 + line["latency_ms"] / 1e3
-        for line in lines
-        if line["result"] == "acked"
+        json.loads(line)["result"] for line in text.splitlines(keepends=True) if line[-1] == "\n"
     ]
 
 
 async def test_a_drive_ends_with_exit_0_and_a_server_told_to_stop_does_too(
     street: Any, tmp_path: Path
 ) -> None:
-    ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
-    saved = tmp_path / "saved"
-    options = ("--listen", "127.0.0.1:0", "--record", str(saved), "--metrics-port", "0")
-    async with server_process(street, ready, *options) as server:
-        agent = await start(
-            "cav_agent", *agent_arguments(street, ready.read_text().strip(), report)
-        )
+    report, saved = tmp_path / "report.jsonl", tmp_path / "saved"
+    options = ("--record", str(saved), "--metrics-port", "0")
+    with server_process(street, tmp_path, *options) as server:
+        agent = await start("cav_agent", *agent_arguments(street, server.address, report))
         _, told = await agent.communicate()
         assert agent.returncode == 0, told
-        server.terminate()
-        _, log = await server.communicate()
-        assert server.returncode == 0, log
-    assert len(acked_at_s(report)) == 6
+        server.process.terminate()
+        assert await asyncio.to_thread(server.process.wait) == 0
+    assert results(report) == ["acked"] * 6
     assert len(recorded(saved, "cav-1", "front")) == 6
-    for line in log.decode().splitlines():
+    for line in server.log_path.read_text().splitlines():
         assert json.loads(line)["level"] in ("info", "warning"), "logs are JSON off a terminal"
 
 
 async def test_an_agent_told_to_stop_finishes_its_frame_and_ends_cleanly(
     street: Any, tmp_path: Path
 ) -> None:
-    ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
-    async with server_process(street, ready, "--listen", "127.0.0.1:0"):
-        arguments = agent_arguments(street, ready.read_text().strip(), report)
+    report = tmp_path / "report.jsonl"
+    with server_process(street, tmp_path) as server:
+        arguments = agent_arguments(street, server.address, report)
         agent = await start("cav_agent", *arguments, "--loop")
-        await appears(lambda: report.exists() and len(acked_at_s(report)) >= 2, agent)
+        await until(lambda: results(report).count("acked") >= 2 or agent.returncode is not None)
         agent.terminate()
         _, told = await agent.communicate()
         assert agent.returncode == 0, told
-    results = [json.loads(line)["result"] for line in report.read_text().splitlines()]
-    assert set(results) <= {"acked", "dropped"}, "nothing that was encoded was lost"
+    assert set(results(report)) <= {"acked", "dropped"}, "nothing that was encoded was lost"
 
 
 @pytest.mark.parametrize(
