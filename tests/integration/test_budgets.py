@@ -243,16 +243,20 @@ async def test_openings_that_fail_again_and_again_make_their_vehicle_wait(
 # --- frames
 
 
-async def test_streams_that_end_with_unusable_frames_make_their_vehicle_wait(
-    serve: Any, raw_vehicle: Any, coded: Any
+@pytest.mark.parametrize("count", [0, MAX_UNUSABLE])
+async def test_streams_of_no_frame_or_of_unusable_ones_make_their_vehicle_wait(
+    serve: Any, raw_vehicle: Any, coded: Any, count: int
 ) -> None:
     damaged = replace(coded.frames[0], packet=replace(coded.frames[0].packet, crc32=1))
 
     async def wasted_stream(server: Any) -> None:
         async with raw_vehicle(server.address) as vehicle:
             await vehicle.greet(coded.hello)
-            for _ in range(MAX_UNUSABLE):
+            for _ in range(count):
                 await vehicle.say(damaged)
+            if count == 0:
+                assert await vehicle.farewell() is grpc.StatusCode.OK
+                return
             assert await vehicle.end() is EXHAUSTED
             assert "could not be used" in await vehicle.stream.details()
 
