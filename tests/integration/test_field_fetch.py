@@ -12,7 +12,7 @@ import pytest
 
 from cav_agent.field_fetch import Beginnings, fetch_field
 from mec_server.fields.shelf import read_chunk
-from rfcore.errors import FieldFormatError, ProtocolError, UnknownField
+from rfcore.errors import FieldFormatError, UnknownField
 from rfcore.field import FieldStore
 from rfcore.field.archive import PREFIX_BYTES, array_ends, header_end
 from rfcore.field.splat_archive import detail_ends
@@ -29,25 +29,6 @@ async def test_a_field_the_vehicle_lacks_is_fetched_and_used(
     assert record.counts == {"acked": 6}
     assert FieldStore(tmp_path / "mine").ids() == (street.field_id,)
     assert [p.name for p in (tmp_path / "mine").iterdir()] == [f"{street.field_id}.rff"]
-
-
-async def test_the_servers_only_field_is_used_when_none_is_named(
-    serve: Any, travel: Any, tmp_path: Path
-) -> None:
-    async with serve() as server:
-        record = await travel(server.address, fields=tmp_path / "mine", field=None)
-    assert record.counts == {"acked": 6}
-
-
-async def test_a_field_the_server_lacks_is_refused_with_both_ids_named(
-    street: Any, serve: Any, travel: Any
-) -> None:
-    """The vehicle holds another field than the server: Hello is refused."""
-    async with serve() as server:
-        with pytest.raises(ProtocolError) as caught:
-            await travel(server.address, fields=street.other_store, field=street.other_id)
-    assert street.other_id in str(caught.value)
-    assert street.field_id in str(caught.value)
 
 
 async def test_a_field_nobody_has_is_refused_with_both_ids_named(

@@ -153,24 +153,6 @@ async def test_a_vehicle_goes_to_the_neighbour_when_its_server_is_killed(
             assert line["server_digest"] == line["reconstruction_digest"]
 
 
-async def test_without_a_neighbour_in_reach_the_newest_picture_waits_for_the_server(
-    roadside: Any, vehicle: Any, tmp_path: Path
-) -> None:
-    """The server of the east is not there: pictures of the west arrive, those of the east wait."""
-    a = roadside("west", replace(WEST, margin_m=0.0), 0.0)
-    b = roadside("east", EAST, 2.0)
-    async with vehicle(
-        a.address, neighbours=(b.address,), fields=tmp_path / "mine",
-        pace=PaceKind.REALTIME, rate=10.0, loop=True,
-    ) as driving:  # fmt: skip
-        await driving.until(lambda: len(b.pictures()) >= 3)
-        b.process.kill()
-        there = len(a.pictures())
-        await driving.until(lambda: len(a.pictures()) >= there + 6)
-    late = [line["reason"] for line in driving.lines() if line["result"] != "acked"]
-    assert late, "what belongs to the east ends somehow, and is counted"
-
-
 async def test_two_tiles_of_one_field_fetch_it_once(
     street: Any, serve: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,37 +50,6 @@ async def test_a_recorded_feed_replaces_the_poses_of_the_drive(
         assert off_m == pytest.approx(0.3, abs=1e-3)  # four decimals of metres, float32
 
 
-async def test_noise_in_a_recorded_feed_is_told_and_stops_nothing(
-    street: Any, serve: Any, travel: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    feed = tmp_path / "feed.jsonl"
-    write_feed(street, feed, PoseErrorModel())
-    lines = feed.read_text().splitlines()
-    lines[3:3] = [
-        "$GPGGA,1*00",
-        lines[0],
-        "{",
-        '{"time_s": NaN, "x_m": 1, "y_m": 2, "z_m": 3}',
-        lines[1],
-    ]
-    feed.write_text("\n".join(lines))
-    async with serve() as server:
-        record = await travel(server.address, feed=PoseFeedSettings(pose_feed=f"file:{feed}"))
-    assert record.counts == {"acked": 6}
-    said = capsys.readouterr().out
-    for reason in ("checksum", "malformed", "not_finite", "backwards"):
-        assert reason in said
-
-
-async def test_a_feed_that_is_not_there_ends_the_start(
-    serve: Any, travel: Any, tmp_path: Path
-) -> None:
-    settings = PoseFeedSettings(pose_feed=f"file:{tmp_path / 'nowhere'}")
-    async with serve() as server:
-        with pytest.raises(OSError, match="nowhere"):
-            await travel(server.address, feed=settings)
-
-
 @asynccontextmanager
 async def gpsd(*places: tuple[float, float]) -> AsyncIterator[int]:
     """A gpsd on a port of its own that reports the places in turn, and then the last for ever."""

@@ -94,12 +94,6 @@ def test_only_what_is_due_is_popped_and_the_next_event_is_named() -> None:
     assert link.held_bytes == 0
 
 
-def test_an_idle_link_starts_at_the_arrival() -> None:
-    link: Link[str] = Link(LinkProfile(rate_bps=8000.0))
-    assert link.push("a", 1000, now=0.0).end_s == 1.0
-    assert link.push("b", 1000, now=7.0).start_s == 7.0
-
-
 def test_a_full_link_refuses_more_and_takes_it_when_the_first_was_sent() -> None:
     link: Link[str] = Link(LinkProfile(rate_bps=8000.0, queue_limit_bytes=1000))
     link.push("a", 1000, now=0.0)

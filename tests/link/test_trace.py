@@ -86,19 +86,6 @@ def test_small_packets_share_an_opportunity_and_a_large_one_takes_several() -> N
     assert through(trace, packets) == [0.010, 0.010, 0.030]
 
 
-def test_an_opportunity_nobody_waits_for_is_lost() -> None:
-    assert through(CapacityTrace((10, 20, 90)), [Arrival(0.015, 1500), Arrival(0.021, 1500)]) == [
-        0.02,
-        0.09,
-    ]
-
-
-def test_the_trace_begins_again_at_its_last_line() -> None:
-    trace = CapacityTrace((10, 100))
-    packets = [Arrival(0.0, 1500)] * 5
-    assert through(trace, packets) == [0.010, 0.100, 0.110, 0.200, 0.210]
-
-
 def test_a_long_rest_is_skipped_at_once() -> None:
     """Nine years of wraps in one step, since the position is computed and not walked."""
     transmission = TraceTransmission(CapacityTrace((1, 1000)))

@@ -33,17 +33,6 @@ EAST, WEST = place("east", 1), place("west", 2)
 DEPARTURE = Departure(*KEY)
 
 
-def test_a_vehicle_that_moves_is_shown_from_its_new_server_on_at_once() -> None:
-    twin = SharedTwin()
-    assert twin.hear(EAST, picture(0), 0.0)
-    assert twin.hear(WEST, picture(0), 0.1)
-    assert not twin.hear(EAST, picture(1), 0.2), "its old session goes on for a moment"
-    assert not twin.hear(EAST, DEPARTURE, 0.3), "the new server shows that camera"
-    assert twin.hear(WEST, picture(1), 0.4)
-    assert twin.hear(WEST, DEPARTURE, 0.5)
-    assert twin.expire(100.0) == []
-
-
 def test_what_arrives_late_of_a_session_that_ended_shows_nothing() -> None:
     twin = SharedTwin()
     assert twin.hear(EAST, picture(0), 0.0)

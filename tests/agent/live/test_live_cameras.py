@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import socket
-import statistics
 import subprocess
 import sys
 import threading
@@ -79,14 +78,6 @@ class Run:
         pages = int(Path(f"/proc/{self.agent.pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
-    def latencies(self) -> str:
-        ack_s = [line["latency_ms"] / 1e3 for line in self.acked()]
-        said = [f"{len(self.acked())} acked of {len(self.lines())}"]
-        for name, values in (("capture to Ack", ack_s), ("capture to shown", self.shown_s)):
-            p99 = statistics.quantiles(values, n=100)[98]
-            said.append(f"{name}: median {statistics.median(values):.3f} s, p99 {p99:.3f} s")
-        return "; ".join(said)
-
 
 @pytest.fixture
 def run(tmp_path: Path, live_camera: Path) -> Iterator[Callable[[str], Run]]:
@@ -148,8 +139,6 @@ def lives_through(run: Run, sender: Any, kills: int, frames: int) -> None:
     assert run.metric("rfedge_agent_source_losses_total") >= kills
     assert run.readers() == 1
     assert run.threads() <= threads + 1
-    print(f"threads {threads} to {run.threads()}", end="; ")
-    print(f"memory {resident_mb:.0f} to {run.resident_mb():.0f} MB; {run.latencies()}")
     assert run.resident_mb() < resident_mb + 30
 
 
