@@ -97,11 +97,14 @@ def low_skies(monkeypatch: pytest.MonkeyPatch) -> None:
     def sunny(day: Daylight, rng: np.random.Generator) -> Sky:
         return sunny_sky(day, rng, height=16)
 
+    def cloudless(day: Daylight, rng: np.random.Generator) -> Sky:
+        return sunny(replace(day, cover=0.0), rng)
+
     def grey(unevenness: float, white: float, rng: np.random.Generator) -> Sky:
         return overcast_sky(unevenness, white, rng, height=16)
 
     monkeypatch.setattr("streetgen.effects.dusk.sunny_sky", sunny)
-    monkeypatch.setattr("streetgen.effects.evening.sunny_sky", sunny)
+    monkeypatch.setattr("streetgen.effects.evening.sunny_sky", cloudless)
     monkeypatch.setattr("streetgen.effects.overcast.overcast_sky", grey)
     blank = Sky(np.full((16, 32, 3), 0.5, np.float32))
     monkeypatch.setattr("streetgen.assembly.clear_sky", lambda _rng: blank)
