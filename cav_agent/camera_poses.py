@@ -15,8 +15,7 @@ from cav_agent.frames import Capture
 from rfcore.camera import Camera, Pose, Vec3, camera_on_rig
 from rfcore.codec.sender.ladder import Rung
 from rfcore.image import I420
-from rfcore.localise.estimate import LocalisationState, PoseEstimate
-from rfcore.localise.prior import PoseMeasurement
+from rfcore.localise.estimate import LocalisationState, PoseEstimate, PoseMeasurement
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.views import FieldView
 

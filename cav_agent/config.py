@@ -14,8 +14,8 @@ from cav_agent.pose_feed.sources import PoseFeedSettings
 from rfcore.codec.h264.config import CRF_RANGE, CoderSettings
 from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.errors import InvalidInput
-from rfcore.wire.checks import check_field_id, check_name
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
+from rfcore.wire.values import check_field_id, check_name
 
 __all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
 

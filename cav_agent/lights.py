@@ -21,7 +21,7 @@ from dataclasses import replace
 import structlog
 
 from rfcore.camera import Camera
-from rfcore.codec.block_means import median_block_mean_difference
+from rfcore.codec.packet import median_block_mean_difference
 from rfcore.field import Quality, RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.views import FieldView, View

@@ -33,7 +33,7 @@ from rfcore.dataset.rig import Rig
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.errors import DatasetError, InvalidInput, RfedgeError
 from rfcore.image import Rgb
-from rfcore.localise.prior import PoseMeasurement
+from rfcore.localise.estimate import PoseMeasurement
 from rfcore.views import PosedPicture
 
 __all__ = ["InstantClock", "LiveCameras", "LiveSchedule", "TrajectoryPoses", "open_live_cameras"]

@@ -16,22 +16,21 @@ from cav_agent.deadline import FixedRung, Rungs
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob
 from cav_agent.lights import TileLights
 from rfcore.camera import Intrinsics
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig, LightChange
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.packet import DeltaPacket
-from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.references import KEPT_FRAMES, RENDER_ONLY, EncoderState, Past
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
 from rfcore.codec.sender.ladder import Rung
 from rfcore.codec.sender.rate import RateModel, RateTarget
-from rfcore.codec.state import KEPT_FRAMES, EncoderState, Past
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, Renderer, render_field_view
 from rfcore.image import I420, Rgb
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
-from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.messages import FrameAddress
+from rfcore.wire.values import MAX_PAYLOAD_BYTES
 
 __all__ = ["Pipeline", "PipelineOptions"]
 

@@ -15,12 +15,12 @@ import grpc
 from cav_agent.config import AgentConfig
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.address import Address, check_handshake
-from rfcore.wire.checks import check_field_id
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, VEHICLE
 from rfcore.wire.tiles import MAX_TILES, Tile, tile_of
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
+from rfcore.wire.values import check_field_id
 
 __all__ = ["WHOLE_STREET", "ServerConnection", "retry_after_s", "server_connections"]
 

@@ -34,7 +34,6 @@ from cav_agent.frames import (
 from cav_agent.pending_frames import FramesInFlight, PredictionChain, WaitingInstants
 from cav_agent.rate_control import BitDivision, ByteBudget, RateControl
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
-from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, MAX_PAYLOAD_BYTES
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import (
     Ack,
@@ -50,6 +49,7 @@ from rfcore.wire.messages import (
     Welcome,
 )
 from rfcore.wire.notices import StreetNotice
+from rfcore.wire.values import FIELD_ID_PREFIX_BYTES, MAX_PAYLOAD_BYTES
 
 __all__ = ["AgentSession", "LinkState", "OutgoingMessage"]
 

@@ -58,13 +58,13 @@ from rfcore.camera import TileOrigin
 from rfcore.dataset.rig import Rig, read_rig
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField
-from rfcore.wire.checks import check_name
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.instruments import Family, MetricsEndpoint
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.tiles import Tile
+from rfcore.wire.values import check_name
 
 __all__ = ["SEARCH_NICENESS", "Vehicle", "metric_families", "yield_to_frames"]
 

@@ -32,8 +32,8 @@ from pathlib import Path
 
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
 from rfcore.files import is_regular, open_at_once
-from rfcore.wire.checks import check_name, shown
-from rfcore.wire.identity import PeerIdentity, Role, parse_identity
+from rfcore.wire.tls import PeerIdentity, Role, parse_identity
+from rfcore.wire.values import check_name, shown
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 from rfcore.codec.packet import CheckedPacket, check_packet
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
-from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, shown
 from rfcore.wire.messages import CameraDescription, Credit, Frame, FrameAddress, Hello
+from rfcore.wire.values import FIELD_ID_PREFIX_BYTES, shown
 
 MAX_GAP = 64
 """Sequences that may be missing at once; credits keep an honest sender far below it."""

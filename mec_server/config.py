@@ -11,9 +11,9 @@ from tyro.conf import Suppress, arg
 
 from rfcore.errors import InvalidInput
 from rfcore.update.run import LearnAs
-from rfcore.wire.checks import MAX_RATE_HZ, check_name, check_range
 from rfcore.wire.nats import NatsServers
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
+from rfcore.wire.values import MAX_RATE_HZ, check_name, check_range
 
 
 class DecoderKind(StrEnum):

@@ -36,7 +36,7 @@ from rfcore.errors import (
     UnknownField,
 )
 from rfcore.wire.conventions import RETRY_AFTER
-from rfcore.wire.identity import peer_identity
+from rfcore.wire.tls import peer_identity
 
 log = structlog.get_logger()
 

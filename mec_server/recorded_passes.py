@@ -19,7 +19,7 @@ import structlog
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, TileOrigin
-from rfcore.codec.block_means import median_block_mean_difference
+from rfcore.codec.packet import median_block_mean_difference
 from rfcore.dataset.picture_file import read_picture
 from rfcore.dataset.recorded_session import RecordedPart, read_recorded_part, recordings_under
 from rfcore.errors import DatasetError

@@ -35,9 +35,8 @@ from mec_server.event_loop import (
     repeat_forever,
 )
 from mec_server.fields.index import FieldIndex, PublishedFields, field_loader
-from mec_server.fields.service import FieldService
-from mec_server.fields.shelf import FieldShelf
-from mec_server.guard import Guard
+from mec_server.fields.service import FieldService, FieldShelf
+from mec_server.guard import Guard, Proxies
 from mec_server.learner import Learner, UnrecordedTrials, learning_job
 from mec_server.ledger.budgets import (
     Resource,
@@ -49,7 +48,6 @@ from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from mec_server.metrics import BackgroundTask, ServerMetrics
 from mec_server.peers import ChargeRpcs, Slots
-from mec_server.proxies import Proxies
 from mec_server.reconstruction import DecodingParts, OpenCameras, Tools, open_cameras
 from mec_server.recorder import FieldTiles, open_recorder
 from mec_server.stream import ServerContext
@@ -63,9 +61,9 @@ from rfcore.errors import RfedgeError
 from rfcore.field import RadianceField
 from rfcore.files import write_whole
 from rfcore.wire.address import Address
-from rfcore.wire.checks import MAX_FIELDS
 from rfcore.wire.conventions import SERVER_OPTIONS
 from rfcore.wire.instruments import Family, MetricsEndpoint
+from rfcore.wire.values import MAX_FIELDS
 
 if TYPE_CHECKING:
     from mec_server.twin.nats import NatsServices

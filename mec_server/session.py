@@ -30,10 +30,8 @@ from rfcore.errors import (
     RfedgeError,
     UnknownField,
 )
-from rfcore.wire.checks import MAX_FIELDS
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import FrameRefused
-from rfcore.wire.identity import PeerIdentity
 from rfcore.wire.messages import (
     Ack,
     ClientMessage,
@@ -48,6 +46,8 @@ from rfcore.wire.messages import (
     Welcome,
 )
 from rfcore.wire.notices import StreetNotice
+from rfcore.wire.tls import PeerIdentity
+from rfcore.wire.values import MAX_FIELDS
 
 MAX_UNUSABLE = 64
 """Messages in a row that are refused before any work is spent on them; then the stream ends."""

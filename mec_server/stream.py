@@ -40,9 +40,9 @@ from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeErr
 from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
-from rfcore.wire.identity import peer_identity
 from rfcore.wire.messages import Frame, Hello
 from rfcore.wire.notices import StreetNotice
+from rfcore.wire.tls import peer_identity
 
 log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[bytes, bytes]

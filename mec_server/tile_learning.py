@@ -38,13 +38,24 @@ from mec_server.tile_history import LEARNING, Learnt, TileHistory, read_historie
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, save_field
 from rfcore.field.store import load_checked
-from rfcore.update.agreement import without_outliers
-from rfcore.update.passes import FEWEST_FRAMES, Pass, SeenFrame, split_frames, spread
-from rfcore.update.run import LearnAs, Update, UpdateSettings, learn_from
+from rfcore.update.passes import (
+    FEWEST_FRAMES,
+    Pass,
+    SeenFrame,
+    split_frames,
+    spread,
+    without_outliers,
+)
+from rfcore.update.run import LearnAs, Update, UpdateSettings, learn_from, saved_percent, try_field
 from rfcore.update.splats import FineTuning
-from rfcore.update.trial import saved_percent, try_field
-from rfcore.wire.publish import Ground, publish, roll_back
-from rfcore.wire.tile_manifest import TileVersions, VersionLabel, read_publication
+from rfcore.wire.tile_manifest import (
+    Ground,
+    TileVersions,
+    VersionLabel,
+    publish,
+    read_publication,
+    roll_back,
+)
 from rfcore.wire.tiles import Tile
 
 log = structlog.get_logger()

@@ -1,6 +1,6 @@
 """A certificate authority for one deployment: X.509 version 3 (RFC 5280), ECDSA on P-256.
 
-Each certificate names one identity (``rfcore.wire.identity``), a server's also its hosts. The
+Each certificate names one identity (``rfcore.wire.tls``), a server's also its hosts. The
 authority's own certificate may sign certificates only, and no certificate that it signed may sign.
 
 ``write_certificates`` writes a folder of certificates and keys as a whole or not at all, with keys
@@ -20,8 +20,8 @@ from pathlib import Path
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.extras import needs
 from rfcore.files import whole_folder, write_whole
-from rfcore.wire.checks import shown
-from rfcore.wire.identity import Role, identity_uri
+from rfcore.wire.tls import Role, identity_uri
+from rfcore.wire.values import shown
 
 with needs("ops"):
     from cryptography import x509

@@ -15,8 +15,7 @@ from itertools import pairwise
 from rfcore.camera import Pose
 from rfcore.field import RadianceField
 from rfcore.image import I420
-from rfcore.localise.estimate import PoseEstimate
-from rfcore.localise.prior import PoseMeasurement
+from rfcore.localise.estimate import PoseEstimate, PoseMeasurement
 from rfcore.localise.tracker import PoseTracker
 from rfcore.views import FieldView, PosedPicture
 

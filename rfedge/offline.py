@@ -18,17 +18,17 @@ from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
-from rfcore.codec.sender.frame_costs import FrameCosts
+from rfcore.codec.sender.rate import FrameCosts
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError, DatasetError, InvalidData, PacketRejected
 from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
-from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
+from rfcore.wire.values import MAX_PAYLOAD_BYTES
 
 __all__ = [
     "Arrival",

@@ -29,13 +29,13 @@ import numpy as np
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.image import I420, png_bytes
-from rfcore.wire.checks import check_name
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
     Subscription,
     TwinPicture,
 )
+from rfcore.wire.values import check_name
 
 __all__ = [
     "PictureFolder",

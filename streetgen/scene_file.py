@@ -20,7 +20,7 @@ from dataclasses import field as with_factory
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
-from rfcore.dataset.mounts import mounts_named
+from rfcore.dataset.rig import mounts_named
 from rfcore.errors import InvalidInput
 from rfcore.tables import Range, Table
 from streetgen.effects import EFFECTS, EffectKind, load_effect
@@ -155,7 +155,7 @@ class DriveSettings:
     lane_offset_m: Annotated[float, LANE_OFFSET_M] = 0.0
     size_px: Size = (640, 360)
     rig: str = "mid_front,mid_left,mid_right,mid_back"
-    """The car's cameras that take the split ``rig`` (``rfcore.dataset.mounts``), or all."""
+    """The car's cameras that take the split ``rig`` (``rfcore.dataset.rig``), or all."""
 
     @property
     def frames(self) -> int:

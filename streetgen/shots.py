@@ -17,7 +17,7 @@ from enum import StrEnum
 import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.dataset.mounts import RIG, mounts_named
+from rfcore.dataset.rig import RIG, mounts_named
 from rfcore.errors import InvalidInput
 from streetgen.geometry.layout import Layout
 from streetgen.scene_file import Scene

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from rfcore.camera import Pose
-from rfcore.dataset.mounts import Mount
+from rfcore.dataset.rig import Mount
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from streetgen.geometry.layout import LANE_M
 from streetgen.geometry.mesh import F64

@@ -31,7 +31,7 @@ from cav_agent.pose_feed.fix import FeedProblem, FieldPlacement, Fix
 from rfcore.camera import Camera, Pose, Vec3
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import Bounds
-from rfcore.localise.prior import PoseMeasurement, PosePrior
+from rfcore.localise.estimate import PoseMeasurement, PosePrior
 from rfcore.views import PosedPicture
 
 __all__ = [

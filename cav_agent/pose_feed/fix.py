@@ -15,7 +15,7 @@ from enum import StrEnum
 from rfcore.camera import Pose, TileOrigin, Vec3
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.geodesy import Anchor
-from rfcore.localise.prior import PoseMeasurement
+from rfcore.localise.estimate import PoseMeasurement
 from rfcore.motion import quaternion_from_vector
 
 __all__ = ["BadReading", "CameraMount", "FeedProblem", "FieldPlacement", "Fix", "finite"]

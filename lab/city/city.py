@@ -57,7 +57,7 @@ from numpy.typing import NDArray
 from mec_server.config import AdmissionLimits
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.tables import Range, Table
-from rfcore.wire.checks import MAX_CAMERAS
+from rfcore.wire.values import MAX_CAMERAS
 from rfedge.arguments import parse_size
 from rfedge.sizing.estimate import Assumptions, Demand
 

@@ -34,7 +34,8 @@ from lab.latency.report import NeededRow, PlayedRow, ShownRow, latency_parts
 from rfcore.codec.sender.ladder import Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfcore.link import DirectionPlan, LinkProfile
+from rfcore.link.plan import DirectionPlan
+from rfcore.link.shaper import LinkProfile
 from rfcore.link.traces import read_mahimahi
 from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lab.localisation.rows import LocaliseRow
 from rfcore.camera import Pose
 from rfcore.field import Renderer
-from rfcore.localise.prior import PosePrior, moved
+from rfcore.localise.estimate import PosePrior, moved
 from rfcore.views import PosedPicture
 from rfedge.localisation.searches import (
     SearchOutcome,

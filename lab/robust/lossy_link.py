@@ -26,12 +26,11 @@ from av.error import FFmpegError
 from av.video.frame import PictureType
 
 from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig, even_size_px
 from rfcore.codec.h264.ffmpeg import picture_of, video_frame
-from rfcore.codec.h264.header import StreamHeader
-from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.references import RENDER_ONLY, EncoderState, Past
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
-from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.metrics import ssim

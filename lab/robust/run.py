@@ -38,8 +38,8 @@ from rfcore.codec.photometric import Photometric
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
+from rfcore.localise.estimate import PosePrior
 from rfcore.localise.localiser import Localised, Localiser
-from rfcore.localise.prior import PosePrior
 from rfcore.motion import quaternion_from_vector
 from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip, Drive, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip

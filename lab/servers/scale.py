@@ -31,7 +31,7 @@ from lab.servers.fleet import (
     shown_twice,
 )
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import Ground, publish
 from rfcore.wire.tiles import Area
 from rfedge.arguments import parse_size
 from rfedge.datasets.convert import convert_dataset

@@ -45,7 +45,6 @@ from rfcore.perception.contacts import Detection, cut_out
 from rfcore.perception.ground import FieldGround
 from rfcore.perception.objects import CameraKey, RulesOut, rules_nothing_out
 from rfcore.views import View
-from rfcore.wire.checks import check_label, shown
 from rfcore.wire.tiles import Tile
 from rfcore.wire.twin import encoded_picture
 from rfcore.wire.twin_render import (
@@ -55,6 +54,7 @@ from rfcore.wire.twin_render import (
     RenderedView,
     ViewRequest,
 )
+from rfcore.wire.values import check_label, shown
 
 R = TypeVar("R")
 OpenField = Callable[[str], RadianceField]

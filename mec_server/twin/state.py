@@ -20,8 +20,7 @@ from rfcore.image import I420
 from rfcore.perception.objects import CameraKey
 from rfcore.views import View
 from rfcore.wire.messages import Frame
-from rfcore.wire.newest_queue import NewestQueue
-from rfcore.wire.twin import Departure, Subscription
+from rfcore.wire.twin import Departure, NewestQueue, Subscription
 from rfcore.wire.twin_render import DEFAULT_AGE_S, MAX_AGE_S
 
 MAX_DEPARTED = 32

@@ -16,14 +16,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from rfcore.codec.block_means import BLOCK_MEANS_TOLERANCE, block_mean_difference, block_mean_digest
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.ffmpeg import H264Decoder
-from rfcore.codec.h264.header import StreamHeader
-from rfcore.codec.h264.pcm_picture import without_zeros
-from rfcore.codec.h264.splice import PictureDecoder, SpliceDecoder
-from rfcore.codec.packet import CheckedPacket, DeltaPacket, check_packet
+from rfcore.codec.h264.splice import PictureDecoder, SpliceDecoder, without_zeros
+from rfcore.codec.packet import (
+    BLOCK_MEANS_TOLERANCE,
+    CheckedPacket,
+    DeltaPacket,
+    block_mean_difference,
+    block_mean_digest,
+    check_packet,
+)
 from rfcore.codec.prediction import Prediction
-from rfcore.codec.state import DecoderState, Past
+from rfcore.codec.references import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 from rfcore.native.yuv import digest_pair

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from rfcore.codec.photometric import Photometric, adapt, lit_by
-from rfcore.codec.references import Reference, References
-from rfcore.codec.state import Past
+from rfcore.codec.references import Past, Reference, References
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import correct_i420, relight_i420, warp_i420

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from rfcore.confinement.confine import Confinement
-from rfcore.confinement.seccomp import WHILE_STARTING, Refusal, assembled
+from rfcore.confinement.confine import WHILE_STARTING, Confinement, Refusal, assembled
 from rfcore.errors import BackendUnavailable
 
 SYSTEM = ("/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache")

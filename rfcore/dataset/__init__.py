@@ -1,8 +1,8 @@
 """Readers of posed pictures on disk."""
 
 from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions
-from rfcore.dataset.manifest import verify_manifest, write_manifest
 from rfcore.dataset.read import read_dataset
+from rfcore.files import verify_manifest, write_manifest
 
 __all__ = [
     "Dataset",

@@ -96,7 +96,7 @@ class Dataset:
     ``rate_hz`` is the mean rate of the pictures' times, ``None`` unless every picture has one and
     they increase. ``points`` is ``None`` when the dataset has none. ``undistorted`` counts the
     pictures that are resampled to take a lens out, ``sorted_out`` those that are listed but were
-    deleted as blurred (``rfcore.dataset.transforms``). ``exposure_varies`` is true where the
+    deleted as blurred (``rfcore.dataset.read``). ``exposure_varies`` is true where the
     dataset says that every picture has an exposure of its own. ``anchor`` says where on the Earth
     the tile's axes are, if the dataset does.
     """

@@ -20,6 +20,12 @@
 
 The rig's own axes are free; the camera's are OpenCV's. A drive states the intrinsics of its camera.
 Picture i of every drive was taken at the same instant.
+
+The 18 cameras of a car (``MOUNTS``) serve the CARLA recorder and streetgen. The published method
+names the number of cameras, not their places. These are three rows of six. Heights, reach and tilts
+follow the authors' later recorder (Maftej/rfdvc): low before the bumper and tilted up, at roof
+height and level, high and tilted down. Each row looks to the front, 45 degrees to either side, to
+both sides and back.
 """
 
 from __future__ import annotations
@@ -42,7 +48,7 @@ from rfcore.views import PosedPicture
 RIG_FILE = "rig.toml"
 
 MAX_RIG_CAMERAS = 32
-"""As many as one Hello may name (``rfcore.wire.checks.MAX_CAMERAS``)."""
+"""As many as one Hello may name (``rfcore.wire.values.MAX_CAMERAS``)."""
 
 FARTHEST_M = 100.0
 """A camera further from the rig's origin is on another vehicle."""
@@ -215,3 +221,47 @@ def write_rig(path: Path, rig: Rig) -> None:
         if camera.priority != 1.0:
             lines.append(f"priority = {camera.priority!r}")
     write_whole(path, "\n".join(lines) + "\n")
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A camera on the car, in CARLA's vehicle axes: x forward, y right, z up, metres, degrees."""
+
+    name: str
+    x_m: float
+    y_m: float
+    z_m: float
+    pitch_deg: float
+    yaw_deg: float
+
+
+ROWS = (("low", 5.5, 0.5, 15.0), ("mid", 2.5, 2.5, 0.0), ("high", 2.5, 5.5, -15.0))
+"""Name, reach before the car's middle, height, pitch."""
+
+
+def _row(name: str, reach_m: float, z_m: float, pitch_deg: float) -> tuple[Mount, ...]:
+    def mount(side: str, x_m: float, y_m: float, yaw_deg: float) -> Mount:
+        return Mount(f"{name}_{side}", x_m, y_m, z_m, pitch_deg, yaw_deg)
+
+    return (
+        mount("front", reach_m, 0.0, 0.0),
+        mount("front_left", reach_m, 0.0, -45.0),
+        mount("front_right", reach_m, 0.0, 45.0),
+        mount("left", 0.0, -1.0, -90.0),
+        mount("right", 0.0, 1.0, 90.0),
+        mount("back", -reach_m, 0.0, 180.0),
+    )
+
+
+RIG = tuple(mount for row in ROWS for mount in _row(*row))
+
+
+def mounts_named(names: str) -> tuple[Mount, ...]:
+    """Return ``all`` mounts or those of a comma-separated list."""
+    if names == "all":
+        return RIG
+    known = {mount.name: mount for mount in RIG}
+    for name in names.split(","):
+        if name not in known:
+            raise InvalidInput("cameras", f"'{name}' is none of {', '.join(known)}")
+    return tuple(known[name] for name in names.split(","))

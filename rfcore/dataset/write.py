@@ -1,7 +1,7 @@
 """Writing a dataset as ``transforms.json`` (nerfstudio) with pictures and points beside it.
 
 Poses are written in the dataset's own world, float64, with OpenGL camera axes; what
-``rfcore.dataset.transforms`` reads back is what was given.
+``rfcore.dataset.read`` reads back is what was given.
 """
 
 from __future__ import annotations

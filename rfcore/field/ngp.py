@@ -26,8 +26,7 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, check_array_bytes, encode_archive
 from rfcore.field.interface import NGP, Bounds, FieldMetadata, stored_metadata
-from rfcore.field.quality import FULL, Quality
-from rfcore.field.scale import colour_at_scale, view_at_scale
+from rfcore.field.quality import FULL, Quality, colour_at_scale, view_at_scale
 from rfcore.files import DECODED_BYTES
 from rfcore.native.backend import check_backend
 from rfcore.ngp.native import NgpRenderer

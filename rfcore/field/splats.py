@@ -24,9 +24,10 @@ from rfcore.field.quality import (
     LevelsOfDetail,
     Quality,
     check_levels,
+    colour_at_scale,
     splats_at_detail,
+    view_at_scale,
 )
-from rfcore.field.scale import colour_at_scale, view_at_scale
 from rfcore.field.splat_archive import compressed_archive, splat_archive, splats_of_compressed
 from rfcore.field.splat_grid import FINEST, Grain, Steps
 from rfcore.native.yuv import field_view_from_view

@@ -7,7 +7,7 @@ and Matthews, IJCV 2004; on depth, Kerl et al., ICRA 2013)::
     r(x) = I(pi(M X)) - R(x),    J(x) = grad R(x) dpi/dX [1 | -[X]x],
     delta = argmin sum w (r - J delta)^2 + prior,    M <- M exp(delta)^-1
 
-I and R are not luma but its local structure (``rfcore.localise.structure``): a field of noon is
+I and R are not luma but its local structure (``rfcore.localise.matching``): a field of noon is
 aligned with a picture of dusk, which no gain and offset of luma would do. Weights are those of
 Geman and McClure at twice the residuals' spread: what is not in the field has no weight. With
 Cauchy's, a van that overtakes takes the pose along. The prior holds M near where it began, by the
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.extras import needs
-from rfcore.localise.structure import Pyramid
+from rfcore.localise.matching import Pyramid
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.views import BEND_LIMIT, FieldView
 

@@ -32,17 +32,17 @@ from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, Renderer, render_field_view
 from rfcore.image import rgb_from_colour
 from rfcore.localise.agreement import agreement
+from rfcore.localise.estimate import PosePrior, hypotheses
 from rfcore.localise.matching import (
     Features,
     PnpSolution,
+    Pyramid,
     find_features,
     grey,
     lift_matches,
     match_features,
     solve_pose,
 )
-from rfcore.localise.prior import PosePrior, hypotheses
-from rfcore.localise.structure import Pyramid
 from rfcore.localise.track import Track, begin_track
 from rfcore.views import FieldView, View
 
@@ -142,7 +142,7 @@ class Localiser:
     >>> from rfcore.dataset import read_dataset
     >>> from rfcore.field import load_field
     >>> from rfcore.localise.localiser import Localiser
-    >>> from rfcore.localise.prior import PosePrior, moved
+    >>> from rfcore.localise.estimate import PosePrior, moved
     >>> picture = read_dataset(Path("samples/street/transforms_drive_empty.json")).pictures[0]
     >>> right = picture.camera.world_from_cam
     >>> localiser = Localiser(

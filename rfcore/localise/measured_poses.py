@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Pose
 from rfcore.field import Bounds
-from rfcore.localise.estimate import MeasurementError, TrackerEvent
-from rfcore.localise.prior import PoseMeasurement, PosePrior
+from rfcore.localise.estimate import MeasurementError, PoseMeasurement, PosePrior, TrackerEvent
 from rfcore.localise.track import Motion, Track
 from rfcore.motion import quaternion_from_vector, rotation_vector
 

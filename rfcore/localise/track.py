@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Pose, Vec3
 from rfcore.localise.agreement import agreement_on_track, near_on_the_spot
 from rfcore.localise.alignment import Aligned, Expected, Template, align
-from rfcore.localise.structure import Pyramid
+from rfcore.localise.matching import Pyramid
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.views import FieldView
 

@@ -31,11 +31,16 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import FULL, Bounds, Quality, Renderer, render_field_view
 from rfcore.image import I420
 from rfcore.localise.alignment import Expected
-from rfcore.localise.estimate import LocalisationState, PoseEstimate, TrackerEvent
+from rfcore.localise.estimate import (
+    LocalisationState,
+    PoseEstimate,
+    PoseMeasurement,
+    PosePrior,
+    TrackerEvent,
+)
 from rfcore.localise.localiser import Localised, Localiser, Lost
+from rfcore.localise.matching import Pyramid
 from rfcore.localise.measured_poses import UNKNOWN_SPEED_M_S, MeasuredPoses
-from rfcore.localise.prior import PoseMeasurement, PosePrior
-from rfcore.localise.structure import Pyramid
 from rfcore.localise.track import (
     LONGEST_GAP_S,
     Motion,

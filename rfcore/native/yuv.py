@@ -17,7 +17,7 @@ type 1 of ITU-T H.264 figure E-1, which the codec writes into the VUI). A last o
 counted twice, that is, the edge is replicated. No coefficient is off by more than 0.67 / 2**16, so
 a sample differs from the rounded real-valued one by at most 3 * 255 * 0.67 / 2**16 < 0.008 levels
 before rounding. Y lies in 16..235, U and V in 16..240: never 0, which an I_PCM picture could not
-hold (``rfcore.codec.h264.pcm_picture``).
+hold (``rfcore.codec.h264.splice``).
 
 Inverse, each chroma sample standing for its 2x2 block (nearest), clamped to 0..255::
 

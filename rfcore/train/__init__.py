@@ -1,15 +1,17 @@
 """Training of radiance fields from posed pictures."""
 
-from rfcore.train.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from rfcore.train.ngp import NgpModel, NgpSchedule, NgpTrainer, NgpTrainingConfig
 from rfcore.train.schedule import Bands, DensityControl, RateSchedule, Regularisation
 from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.train.trainer import (
+    Checkpoint,
     FieldTrainer,
     HeldOut,
     TrainingProgress,
     held_out_quality,
     mean_psnr_db,
+    read_checkpoint,
+    write_checkpoint,
 )
 
 __all__ = [

@@ -35,9 +35,8 @@ from rfcore.ngp.shape import (
     initial_parameters,
 )
 from rfcore.ngp.trainable import MAX_BLOCK_RAYS, NgpRates, TrainableNgp
-from rfcore.train.checkpoint import Checkpoint
 from rfcore.train.targets import RaySampler, load_targets
-from rfcore.train.trainer import FieldTrainer, HeldOut, settings_of
+from rfcore.train.trainer import Checkpoint, FieldTrainer, HeldOut, settings_of
 from rfcore.views import PointCloud, PosedPicture
 
 MARGIN_SHARE = 0.01

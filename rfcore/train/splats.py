@@ -26,7 +26,6 @@ from rfcore.field.interface import SPLATS
 from rfcore.geodesy import Anchor
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, joined
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer, TrainingState
-from rfcore.train.checkpoint import Checkpoint
 from rfcore.train.poses import PoseCorrection, PoseModel, pose_gradient, typical_depth_m
 from rfcore.train.schedule import (
     Bands,
@@ -39,7 +38,7 @@ from rfcore.train.schedule import (
 )
 from rfcore.train.start import gaussians_from_points, sky_gaussians
 from rfcore.train.targets import ExposureModel, Target, halved, load_targets
-from rfcore.train.trainer import FieldTrainer, HeldOut, settings_of
+from rfcore.train.trainer import Checkpoint, FieldTrainer, HeldOut, settings_of
 from rfcore.views import PointCloud, PosedPicture
 
 STATE_PARTS = ("gaussians", "first_moments", "second_moments")

@@ -7,7 +7,7 @@ round is a weighted least squares for every voxel at once (SIRT, Gilbert 1972), 
 with Nesterov's momentum.
 
 Where two passes disagree the layer would be their mean, so pixels that the others contradict are
-left out (``rfcore.update.agreement``).
+left out (``rfcore.update.passes``).
 """
 
 from __future__ import annotations
@@ -40,8 +40,7 @@ from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import TrainableRasterizer
-from rfcore.update.agreement import trusted_pixels
-from rfcore.update.passes import SeenFrame
+from rfcore.update.passes import SeenFrame, trusted_pixels
 from rfcore.update.splats import Progress
 
 F32 = NDArray[np.float32]

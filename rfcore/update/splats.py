@@ -2,7 +2,7 @@
 
 Stochastic descent on L1 and D-SSIM, one frame an iteration, starts from the present field. L1 leads
 every splat to the median of its observations, so the majority of passes wins. Pixels that the other
-passes contradict (``rfcore.update.agreement``) are left out: at first compared with the present
+passes contradict (``rfcore.update.passes``) are left out: at first compared with the present
 field, which decides between two passes in its own light, and from half-way on compared with what
 was learnt until then, for another light. Density control splits Gaussians where the gradient stays
 large, and removes faded ones.
@@ -22,8 +22,7 @@ from rfcore.field.importance import contributions, most_important_first, reorder
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfcore.train.levels import LevelFitConfig, with_levels
 from rfcore.train.schedule import DensityControl, control_density, view_order
-from rfcore.update.agreement import both, trusted_pixels
-from rfcore.update.passes import SeenFrame
+from rfcore.update.passes import SeenFrame, both, trusted_pixels
 
 Progress = Callable[[str, int, int], None]
 """Called with the present task, how much of it is done, and how much there is."""

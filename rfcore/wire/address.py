@@ -18,8 +18,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
-from rfcore.wire.checks import shown
 from rfcore.wire.tls import TlsFiles
+from rfcore.wire.values import shown
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,21 @@ from array import array
 from google.protobuf.message import DecodeError
 
 from rfcore.camera import Pose
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import InvalidInput
 from rfcore.field.quality import FULL, Quality
-from rfcore.wire.checks import (
+from rfcore.wire.messages import (
+    CameraDescription,
+    ClientMessage,
+    Frame,
+    FrameAddress,
+    Hello,
+    RendererContract,
+)
+from rfcore.wire.v1 import edge_pb2 as pb
+from rfcore.wire.values import (
     FIELD_ID_PREFIX_BYTES,
     MAX_CAMERAS,
     MAX_FIELDS,
@@ -30,17 +39,6 @@ from rfcore.wire.checks import (
     check_field_id,
     check_name,
     check_range,
-)
-from rfcore.wire.messages import (
-    CameraDescription,
-    ClientMessage,
-    Frame,
-    FrameAddress,
-    Hello,
-    RendererContract,
-)
-from rfcore.wire.v1 import edge_pb2 as pb
-from rfcore.wire.values import (
     clock_from_wire,
     clock_to_wire,
     intrinsics_from_wire,

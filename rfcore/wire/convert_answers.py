@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from google.protobuf.message import DecodeError
 
 from rfcore.errors import ProtocolError, RejectReason
-from rfcore.wire.checks import MAX_RATE_HZ
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -24,6 +23,7 @@ from rfcore.wire.messages import (
 )
 from rfcore.wire.notices import StreetNotice, notice_from_wire, notice_to_wire
 from rfcore.wire.v1 import edge_pb2 as pb
+from rfcore.wire.values import MAX_RATE_HZ
 
 REASONS = {reason: pb.RejectReason.Value(f"REJECT_REASON_{reason.name}") for reason in RejectReason}
 REASONS_BACK = {number: reason for reason, number in REASONS.items()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
-from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import RejectReason
 from rfcore.field import FULL, Quality, Renderer, render_field_view

@@ -29,8 +29,8 @@ from urllib.parse import urlsplit
 
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.wire.address import Address
-from rfcore.wire.checks import check_field_id, check_name, check_range, shown
 from rfcore.wire.twin import PictureEncoding
+from rfcore.wire.values import check_field_id, check_name, check_range, shown
 
 PLACES_BUCKET: Final = "rfedge-places"
 FIELDS_BUCKET: Final = "rfedge-fields"

@@ -10,9 +10,16 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from rfcore.errors import InvalidInput, ProtocolError
-from rfcore.wire.checks import check_field_id, check_label, check_name, check_range
 from rfcore.wire.v1 import edge_pb2 as pb
-from rfcore.wire.values import motion_from_wire, motion_to_wire, same_named
+from rfcore.wire.values import (
+    check_field_id,
+    check_label,
+    check_name,
+    check_range,
+    motion_from_wire,
+    motion_to_wire,
+    same_named,
+)
 
 OBJECT = "object"
 MAX_VALID_S = 3600.0

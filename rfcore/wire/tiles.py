@@ -11,9 +11,8 @@ import math
 from dataclasses import asdict, dataclass
 
 from rfcore.errors import InvalidInput
-from rfcore.wire.checks import check_field_id, check_label, check_name, check_range
 from rfcore.wire.v1 import field_pb2 as pb
-from rfcore.wire.values import same_named
+from rfcore.wire.values import check_field_id, check_label, check_name, check_range, same_named
 
 MAX_TILES = 64
 """Tiles one server publishes."""

@@ -6,9 +6,11 @@ that is wrong ``ProtocolError``.
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec.references import References
@@ -17,10 +19,11 @@ from rfcore.image import I420, Rgb, jpeg_bytes, png_bytes, rgb_from_bytes
 from rfcore.localise.estimate import LocalisationState
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.perception.objects import CameraKey
-from rfcore.wire.checks import check_name, check_range
 from rfcore.wire.v1 import twin_pb2
 from rfcore.wire.values import (
     ClockKind,
+    check_name,
+    check_range,
     clock_from_wire,
     clock_to_wire,
     intrinsics_from_wire,
@@ -224,3 +227,40 @@ def encoding_from_wire(number: int) -> PictureEncoding:
         if encoding_to_wire(encoding) == number:
             return encoding
     raise InvalidInput("encoding", f"{number} is no picture encoding this program knows")
+
+
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+
+class NewestQueue(Generic[K, V]):
+    """Entries that wait for one reader: at most one of each key, the longest waiting first.
+
+    A reader that takes entries slowly misses older ones of a key, but never the newest, and takes
+    bounded memory. ``missed`` counts the entries that were replaced; ``arrived`` is called for
+    each entry. Not thread-safe.
+    """
+
+    def __init__(self, arrived: Callable[[], None]) -> None:
+        self.missed = 0
+        self._arrived = arrived
+        self._waiting: OrderedDict[K, V] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def put(self, key: K, entry: V) -> bool:
+        """Add ``entry``; return whether it replaced one of its key, whose turn it then has."""
+        replaced = key in self._waiting
+        self.missed += replaced
+        self._waiting[key] = entry
+        self._arrived()
+        return replaced
+
+    def discard(self, key: K) -> None:
+        """Remove the entry of ``key``, if one waits; it does not count as missed."""
+        self._waiting.pop(key, None)
+
+    def take(self) -> V | None:
+        """Remove and return the entry that waits longest; None if there is none."""
+        return self._waiting.popitem(last=False)[1] if self._waiting else None

@@ -16,13 +16,6 @@ from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.field.quality import FULL, Quality
 from rfcore.image import Rgb
 from rfcore.perception.objects import CameraKey, StreetObject
-from rfcore.wire.checks import (
-    check_bytes,
-    check_field_id,
-    check_label,
-    check_name,
-    check_range,
-)
 from rfcore.wire.twin import (
     PictureEncoding,
     decoded_picture,
@@ -31,6 +24,11 @@ from rfcore.wire.twin import (
 )
 from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.values import (
+    check_bytes,
+    check_field_id,
+    check_label,
+    check_name,
+    check_range,
     intrinsics_from_wire,
     intrinsics_to_wire,
     motion_from_wire,

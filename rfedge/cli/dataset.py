@@ -245,7 +245,7 @@ class DatasetRecordCarla:
 
     def run(self) -> None:
         """Connect, record, and write the dataset."""
-        from rfcore.dataset.mounts import mounts_named
+        from rfcore.dataset.rig import mounts_named
         from rfcore.errors import RfedgeError
         from rfcore.extras import needs
         from rfcore.files import whole_folder

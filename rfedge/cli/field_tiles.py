@@ -51,8 +51,7 @@ class FieldPublish:
         """Publish, and say what is current."""
         from datetime import UTC, datetime
 
-        from rfcore.wire.publish import Ground, publish
-        from rfcore.wire.tile_manifest import VersionLabel
+        from rfcore.wire.tile_manifest import Ground, VersionLabel, publish
         from rfcore.wire.tiles import Area
         from rfedge.datasets.convert import read_tiles
 
@@ -74,7 +73,7 @@ class FieldPublish:
         from datetime import UTC, datetime
 
         from rfcore.errors import InvalidInput
-        from rfcore.wire.publish import Ground, publish
+        from rfcore.wire.tile_manifest import Ground, publish
         from rfcore.wire.tiles import Area
 
         default = {each.name: each.default for each in fields(self)}
@@ -153,7 +152,7 @@ class FieldRollback:
 
     def run(self) -> None:
         """Roll back, and say what is current."""
-        from rfcore.wire.publish import roll_back
+        from rfcore.wire.tile_manifest import roll_back
 
         print(_current(roll_back(self.folder, self.tile, self.to, self.light), self.light))
 

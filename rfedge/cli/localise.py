@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from rfcore.field import RadianceField
-    from rfcore.localise.prior import PosePrior
+    from rfcore.localise.estimate import PosePrior
     from rfcore.views import PosedPicture
     from rfedge.localisation.searches import RecordedFeed
 

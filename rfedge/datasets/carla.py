@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.mounts import RIG, Mount
+from rfcore.dataset.rig import RIG, Mount
 from rfcore.dataset.source import SourceCamera
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput, RfedgeError

@@ -25,8 +25,8 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field import FULL, RadianceField
 from rfcore.files import whole_folder
 from rfcore.image import Rgb
+from rfcore.localise.estimate import PosePrior
 from rfcore.localise.localiser import Localised, Localiser, LocaliserSettings, median_depth
-from rfcore.localise.prior import PosePrior
 from rfedge.fields.viewpoints import UPS, looking_at, middle_of
 
 __all__ = ["FieldRegistration", "RegisterSettings", "register_pictures"]

@@ -17,8 +17,8 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from rfcore.link import DirectionPlan, Link
-from rfcore.link.shaper import BusyMeter
+from rfcore.link.plan import DirectionPlan
+from rfcore.link.shaper import BusyMeter, Link
 from rfcore.wire.instruments import Family, Instruments
 
 __all__ = ["SPIN_S", "Direction", "LinkMetrics", "Sender"]

@@ -33,7 +33,8 @@ from prometheus_client import CollectorRegistry
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
-from rfcore.link import DirectionPlan, LinkPlan, LinkProfile, read_link
+from rfcore.link.plan import DirectionPlan, LinkPlan, read_link
+from rfcore.link.shaper import LinkProfile
 from rfcore.wire.address import Address
 from rfcore.wire.instruments import MetricsEndpoint
 from rfedge.link.direction import SPIN_S, Direction, LinkMetrics

@@ -20,8 +20,8 @@ from statistics import NormalDist
 import numpy as np
 
 from rfcore.errors import InvalidInput
-from rfcore.wire.checks import MAX_CAMERAS, MAX_PAYLOAD_BYTES
 from rfcore.wire.settings import RenderSettings
+from rfcore.wire.values import MAX_CAMERAS, MAX_PAYLOAD_BYTES
 
 __all__ = [
     "Bounds",

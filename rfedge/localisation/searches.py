@@ -32,8 +32,8 @@ from rfcore.errors import InvalidData, InvalidInput, RfedgeError
 from rfcore.field import FULL, Bounds, Renderer
 from rfcore.files import write_whole
 from rfcore.image import Rgb
+from rfcore.localise.estimate import PosePrior, moved
 from rfcore.localise.localiser import Localised, Localiser, Lost, median_depth
-from rfcore.localise.prior import PosePrior, moved
 from rfcore.motion import rotation_vector
 from rfcore.views import PosedPicture
 

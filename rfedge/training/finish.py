@@ -33,7 +33,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.train import held_out_quality
 from rfcore.train.levels import LevelFitConfig, fitted, with_levels
 from rfcore.update.passes import SeenFrame, spread
-from rfcore.update.trial import Trial, saved_percent, try_field
+from rfcore.update.run import Trial, saved_percent, try_field
 from rfcore.views import PosedPicture
 
 __all__ = [

@@ -35,9 +35,9 @@ from rfcore.wire.nats import (
     vehicle_of_subject,
     wanted_subject,
 )
-from rfcore.wire.newest_queue import NewestQueue
 from rfcore.wire.twin import (
     Departure,
+    NewestQueue,
     PictureEncoding,
     Subscription,
     TwinPicture,

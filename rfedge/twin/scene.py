@@ -17,8 +17,7 @@ from rfcore.camera import Intrinsics, TileOrigin
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.spz import encode_spz
 from rfcore.perception.objects import CameraKey, StreetObject
-from rfcore.wire.newest_queue import NewestQueue
-from rfcore.wire.twin import TwinPicture
+from rfcore.wire.twin import NewestQueue, TwinPicture
 
 __all__ = ["Board", "DrivePicture", "Message", "PlacedField", "Reader", "TwinScene"]
 

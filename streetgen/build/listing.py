@@ -25,8 +25,7 @@ import numpy as np
 import streetgen
 from rfcore.camera import Pose
 from rfcore.dataset import write_manifest
-from rfcore.dataset.mounts import mounts_named
-from rfcore.dataset.rig import RIG_FILE, Rig, RigCamera, write_rig
+from rfcore.dataset.rig import RIG_FILE, Rig, RigCamera, mounts_named, write_rig
 from rfcore.dataset.source import SourceCamera, SourcePoints, read_points
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
 from rfcore.errors import InvalidInput

@@ -9,8 +9,8 @@ import pytest
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob
 from cav_agent.session import AgentSession
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT

@@ -19,8 +19,7 @@ from cav_agent.frames import Capture
 from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
 from rfcore.codec.sender.ladder import FULL_RUNG, Rung
 from rfcore.image import I420
-from rfcore.localise.estimate import LocalisationState
-from rfcore.localise.prior import PoseMeasurement
+from rfcore.localise.estimate import LocalisationState, PoseMeasurement
 
 MakeCapture = Callable[..., Capture]
 INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)

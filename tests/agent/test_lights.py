@@ -4,7 +4,7 @@ import numpy as np
 
 from cav_agent.lights import FITS_LEVELS, TRY_EVERY, TileLights
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec.block_means import median_block_mean_difference
+from rfcore.codec.packet import median_block_mean_difference
 from rfcore.field import FULL, FieldMetadata, Quality, SplatField
 from rfcore.field.quality import Beginning
 from rfcore.harmonics import SH_DC

@@ -15,9 +15,8 @@ from cav_agent.frames import Capture, FrameResult, Outcome
 from cav_agent.rate_control import LEAST_CAMERA_SHARE, BitDivision, RateControl
 from cav_agent.session import AgentSession
 from rfcore.errors import InvalidInput
-from rfcore.link import LinkProfile
 from rfcore.link.plan import read_link
-from rfcore.link.shaper import Link, LinkParts
+from rfcore.link.shaper import Link, LinkParts, LinkProfile
 from rfcore.wire.messages import (
     FrameAddress,
     Hello,

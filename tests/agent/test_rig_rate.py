@@ -10,8 +10,7 @@ from agent.link_world import LOWEST_CRF, ModelCoder, World
 from cav_agent.frames import Capture, FrameResult, Outcome
 from cav_agent.rate_control import BitDivision, RateControl
 from cav_agent.session import AgentSession
-from rfcore.link import LinkProfile
-from rfcore.link.shaper import Link
+from rfcore.link.shaper import Link, LinkProfile
 from rfcore.wire.messages import FrameAddress, Hello
 
 RATE_HZ = 5

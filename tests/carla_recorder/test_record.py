@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rfcore.dataset import read_dataset
-from rfcore.dataset.mounts import RIG, mounts_named
+from rfcore.dataset.rig import RIG, mounts_named
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.carla import CarlaRecorder, CarlaRecordSettings
 

@@ -8,7 +8,7 @@ import pytest
 from cryptography import x509
 
 from rfcore.errors import AccessDenied, InvalidData, InvalidInput
-from rfcore.wire.identity import PeerIdentity, Role, identity_uri, peer_identity
+from rfcore.wire.tls import PeerIdentity, Role, identity_uri, peer_identity
 from rfedge.certs import (
     Issued,
     Members,

@@ -9,13 +9,12 @@ import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.photometric import sent_light
-from rfcore.codec.references import INTRA, RENDER_ONLY, Reference
+from rfcore.codec.references import INTRA, RENDER_ONLY, DecoderState, Reference
 from rfcore.codec.sender.encoder import LEFT_TO_THE_ENCODER, DeltaEncoder, Encoded, FrameChoice
-from rfcore.codec.state import DecoderState
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour
 from rfcore.views import FieldView

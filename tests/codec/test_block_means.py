@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rfcore.codec.block_means import (
+from rfcore.codec.packet import (
     BLOCK_MEANS_BYTES,
     BLOCK_MEANS_TOLERANCE,
     block_mean_difference,

@@ -7,10 +7,9 @@ import pytest
 
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import Reference
-from rfcore.codec.sender import frame_costs
+from rfcore.codec.sender import rate
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
-from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
-from rfcore.codec.sender.rate import RateModel, RateTarget
+from rfcore.codec.sender.rate import FrameCosts, RateDistortion, RateModel, RateTarget
 from rfcore.image import I420
 from rfcore.native.warp import BlockCosts
 from rfcore.views import FieldView
@@ -25,14 +24,14 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """The pairs of luma planes that the kernel was asked about, by identity."""
     made: list[tuple[int, int]] = []
     kept = []  # so that no plane's id is given to another one
-    kernel = frame_costs.block_costs
+    kernel = rate.block_costs
 
     def noted(frame: np.ndarray, picture: np.ndarray) -> BlockCosts:
         made.append((id(frame), id(picture)))
         kept.append((frame, picture))
         return kernel(frame, picture)
 
-    monkeypatch.setattr(frame_costs, "block_costs", noted)
+    monkeypatch.setattr(rate, "block_costs", noted)
     return made
 
 

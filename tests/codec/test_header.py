@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.bitstream import StreamHeader, check_header, stream_header
 from rfcore.codec.h264.config import EFFORTS, PRESETS, CodecConfig, Coder, CoderSettings
-from rfcore.codec.h264.header import StreamHeader, check_header, stream_header
-from rfcore.codec.h264.pcm_picture import pcm_pps
-from rfcore.codec.h264.slices import SliceCoding, encode_slice
+from rfcore.codec.h264.splice import pcm_pps
 from rfcore.codec.sender.encoder import DeltaEncoder
+from rfcore.codec.sender.picture_coder import SliceCoding, encode_slice
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView
@@ -71,7 +71,7 @@ def test_no_preset_crf_number_of_references_or_threads_changes_the_sets_of_x264(
 def test_other_sets_than_those_that_are_expected_of_x264_are_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("rfcore.codec.h264.slices.X264_REFERENCE_FRAMES", 4)
+    monkeypatch.setattr("rfcore.codec.sender.picture_coder.X264_REFERENCE_FRAMES", 4)
     with pytest.raises(CodecError, match="other parameter sets than it was configured for"):
         DeltaEncoder(X264)
 

@@ -15,7 +15,7 @@ from rfcore.codec.h264.bitstream import (
 )
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.ffmpeg import H264Decoder
-from rfcore.codec.h264.pcm_picture import PcmPictures, PcmPlace, pcm_pps, without_zeros
+from rfcore.codec.h264.splice import PcmPictures, PcmPlace, pcm_pps, without_zeros
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420

@@ -11,8 +11,14 @@ from hypothesis import strategies as st
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import INTRA, RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
-from rfcore.codec.sender.frame_costs import FrameCosts
-from rfcore.codec.sender.rate import CLIMB_CRF, BitsCurve, RateModel, RateTarget, bits_curve
+from rfcore.codec.sender.rate import (
+    CLIMB_CRF,
+    BitsCurve,
+    FrameCosts,
+    RateModel,
+    RateTarget,
+    bits_curve,
+)
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field, render_field_view

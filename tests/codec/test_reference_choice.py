@@ -11,15 +11,14 @@ from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.photometric import adapt, check_photometric, solve
 from rfcore.codec.prediction import Prediction
-from rfcore.codec.references import INTRA, RENDER_ONLY, Reference
+from rfcore.codec.references import INTRA, RENDER_ONLY, Past, Reference
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
-from rfcore.codec.sender.frame_costs import FrameCosts
+from rfcore.codec.sender.rate import FrameCosts
 from rfcore.codec.sender.reference_choice import (
     choose_photometric,
     choose_references,
     light_differs,
 )
-from rfcore.codec.state import Past
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView

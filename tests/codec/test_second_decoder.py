@@ -15,8 +15,8 @@ import pytest
 
 from codec.sent_streams import make_stream
 from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.bitstream import stream_header
 from rfcore.codec.h264.config import REFERENCE_FRAMES, CodecConfig
-from rfcore.codec.h264.header import stream_header
 from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, SliceCoder
 from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.image import I420

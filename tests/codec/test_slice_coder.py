@@ -16,10 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rfcore.codec.h264.bitstream import NAL_IDR, NAL_P, join_nals, nal_type
+from rfcore.codec.h264.bitstream import NAL_IDR, NAL_P, join_nals, nal_type, stream_header
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.ffmpeg import H264Decoder
-from rfcore.codec.h264.header import stream_header
 from rfcore.codec.h264.slice_coder import (
     LAMBDA_FACTOR,
     Effort,

@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from rfcore.codec.h264.bitstream import StreamHeader, stream_header
 from rfcore.codec.h264.config import REFERENCE_FRAMES, CodecConfig
-from rfcore.codec.h264.header import StreamHeader, stream_header
 from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, OwnSlice, SliceCoder
 from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.errors import InvalidInput

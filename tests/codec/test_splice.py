@@ -11,8 +11,8 @@ from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import join_nals
 from rfcore.codec.h264.config import CodecConfig, effort_of_preset
 from rfcore.codec.h264.ffmpeg import H264Decoder, PictureKind, encode_pictures
-from rfcore.codec.h264.slices import slice_options
 from rfcore.codec.sender.encoder import DeltaEncoder
+from rfcore.codec.sender.picture_coder import slice_options
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView

@@ -11,9 +11,8 @@ from codec.sent_streams import exchange
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.references import INTRA, RENDER_ONLY, Reference
+from rfcore.codec.references import INTRA, KEPT_FRAMES, RENDER_ONLY, EncoderState, Reference
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
-from rfcore.codec.state import KEPT_FRAMES, EncoderState
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 from rfcore.views import FieldView

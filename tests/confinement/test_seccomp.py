@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rfcore.confinement.seccomp import (
+from rfcore.confinement.confine import (
     MACHINES,
     NUMBERS,
     WHILE_READING,

@@ -11,7 +11,7 @@ from rfcore.camera import Pose, camera_on_rig
 from rfcore.dataset.rig import MAX_RIG_CAMERAS, Rig, RigCamera, read_rig, read_rig_drive, write_rig
 from rfcore.errors import DatasetError
 from rfcore.image import write_png
-from rfcore.wire.checks import MAX_CAMERAS, MAX_LEVER_ARM_M
+from rfcore.wire.values import MAX_CAMERAS, MAX_LEVER_ARM_M
 
 EXTRINSICS = "camera_from_rig = [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0]]\n"
 FRONT = f'[[camera]]\nname = "front"\ndrive = "front"\n{EXTRINSICS}'

@@ -24,9 +24,8 @@ from lab.servers.envoy import CLUSTER
 from mec_server.config import ServerConfig
 from rfcore.errors import FieldFormatError, InvalidData, RfedgeError
 from rfcore.wire.conventions import VEHICLE
-from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import OPTIONS
-from rfcore.wire.tile_manifest import read_publication
+from rfcore.wire.tile_manifest import Ground, publish, read_publication
 from rfcore.wire.tiles import Area
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub

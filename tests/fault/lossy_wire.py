@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 
-from rfcore.link import Link, LinkProfile
+from rfcore.link.shaper import Link, LinkProfile
 
 TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x400454CA, 0x1, 0x1000  # linux/if_tun.h
 MTU_BYTES = 1500

@@ -15,8 +15,8 @@ import grpc
 import pytest
 
 from fault.conftest import FAULT_S
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import RejectReason
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD

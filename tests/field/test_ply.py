@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError
 from rfcore.field import ply_table
-from rfcore.field.ply import write_ply
 from rfcore.field.ply_table import read_vertices, write_vertices
-from rfcore.field.splat_file import read_splat_file
+from rfcore.field.splat_file import read_splat_file, write_ply
 from rfcore.raster.gaussians import Gaussians
 
 NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")

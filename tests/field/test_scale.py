@@ -6,7 +6,7 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, SplatField
-from rfcore.field.scale import colour_at_scale, view_at_scale
+from rfcore.field.quality import colour_at_scale, view_at_scale
 from rfcore.views import View
 
 HALF = Quality(scale=0.5)

@@ -23,8 +23,8 @@ from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import parse_slice_start, split_nals
 from rfcore.codec.packet import DeltaPacket
-from rfcore.codec.state import DecoderState
-from rfcore.dataset.transforms import read_transforms_source
+from rfcore.codec.references import DecoderState
+from rfcore.dataset.read import read_transforms_source
 from rfcore.errors import (
     FieldFormatError,
     InvalidInput,
@@ -34,7 +34,7 @@ from rfcore.errors import (
 )
 from rfcore.field import render_field_view
 from rfcore.field.archive import ALIGN_BYTES, PREFIX, decode_archive
-from rfcore.field.ply import read_open_ply
+from rfcore.field.splat_file import read_open_ply
 from rfcore.field.spz import read_open_spz
 from rfcore.field.store import decode_field
 from rfcore.views import FieldView

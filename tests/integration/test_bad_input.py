@@ -6,8 +6,8 @@ from typing import Any
 
 import grpc
 
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Ack, Frame, Nack
 from rfcore.wire.v1 import edge_pb2 as pb

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from mec_server.tile_history import LEARNING, Learnt, TileHistory
-from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import Ground, publish
 from rfedge.processes import command_of
 
 ROOT = Path(__file__).parents[2]

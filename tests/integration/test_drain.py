@@ -12,7 +12,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from cav_agent.config import AgentLimits
 from rfcore.wire.messages import Ack, DrainNotice
-from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import Ground, publish
 from rfcore.wire.tiles import Area
 
 PATIENT = AgentLimits(answer_s=60.0, stall_s=60.0)

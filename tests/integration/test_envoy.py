@@ -32,12 +32,12 @@ from lab.servers.envoy import (
 )
 from lab.servers.fleet import resumed_s
 from lab.servers.scale import run_scale
-from mec_server.proxies import FORWARDED
+from mec_server.guard import FORWARDED
 from rfcore.errors import RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD, TILE
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import TransportSettings
+from rfcore.wire.tile_manifest import Ground, publish
 from rfcore.wire.tiles import Area
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2 as pb

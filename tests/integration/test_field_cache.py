@@ -21,7 +21,7 @@ from cav_agent.frame_log import DriveObserver
 from cav_agent.handover import ServedTile
 from cav_agent.metrics import AgentMetrics
 from cav_agent.server_connection import ServerConnection, server_connections
-from mec_server.fields.shelf import CHUNK_BYTES, read_chunk
+from mec_server.fields.service import CHUNK_BYTES, read_chunk
 from rfcore.camera import Camera, TileOrigin
 from rfcore.codec.h264.config import CoderSettings
 from rfcore.errors import InvalidInput, RfedgeError
@@ -29,8 +29,7 @@ from rfcore.field import FieldMetadata, FieldStore, SplatField, save_field
 from rfcore.field.quality import FULL
 from rfcore.image import I420
 from rfcore.raster.gaussians import Gaussians
-from rfcore.wire.publish import Ground, publish
-from rfcore.wire.tile_manifest import VersionLabel
+from rfcore.wire.tile_manifest import Ground, VersionLabel, publish
 from rfcore.wire.tiles import Tile
 
 

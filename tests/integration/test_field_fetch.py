@@ -11,7 +11,7 @@ import grpc
 import pytest
 
 from cav_agent.field_fetch import Beginnings, fetch_field
-from mec_server.fields.shelf import read_chunk
+from mec_server.fields.service import read_chunk
 from rfcore.errors import FieldFormatError, UnknownField
 from rfcore.field import FieldStore
 from rfcore.field.archive import PREFIX_BYTES, array_ends, header_end

@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 from cav_agent.config import AgentLimits, PaceKind
-from mec_server.fields.shelf import read_chunk
+from mec_server.fields.service import read_chunk
 from recorded import recorded
 from rfcore.camera import TileOrigin
 from rfcore.dataset.recorded_session import RecordedPicture
 from rfcore.field import FieldMetadata, SplatField, save_field
-from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import Ground, publish
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import (
     Departure,

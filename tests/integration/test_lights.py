@@ -18,8 +18,7 @@ from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore, SplatField, load_field, save_field
 from rfcore.field.delta import delta_of
 from rfcore.field.layer import VOXELS_M, ColourLayer, layer_archive, layered_field, voxels_of
-from rfcore.wire.publish import Ground, publish
-from rfcore.wire.tile_manifest import VersionLabel
+from rfcore.wire.tile_manifest import Ground, VersionLabel, publish
 from rfcore.wire.tiles import PREVIEW
 from rfedge.fields.slim import slimmed
 

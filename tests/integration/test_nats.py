@@ -26,8 +26,7 @@ from mec_server.nats import NatsLink, fetch_object
 from mec_server.twin.nats import PlaceRecords
 from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
 from rfcore.wire.nats import FIELDS_BUCKET, PLACES_BUCKET, NatsServers, VehicleLocation
-from rfcore.wire.publish import Ground, publish
-from rfcore.wire.tile_manifest import MANIFEST
+from rfcore.wire.tile_manifest import MANIFEST, Ground, publish
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import Departure, PictureEncoding, Subscription, TwinPicture
 from rfedge.certs import Members, certify, write_certificates

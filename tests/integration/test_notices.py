@@ -27,8 +27,7 @@ from rfcore.perception.ground import FieldGround
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.messages import Ack, Frame, Hello
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
-from rfcore.wire.publish import Ground, publish
-from rfcore.wire.tile_manifest import VersionLabel
+from rfcore.wire.tile_manifest import Ground, VersionLabel, publish
 from rfcore.wire.twin_render import ViewRequest, view_request_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.loadtest.prerecorded import PrerecordedDrive

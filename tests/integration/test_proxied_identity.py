@@ -12,7 +12,7 @@ import structlog
 import mec_server.server
 from live_server import Files, certificates, channel_to, open_stream
 from mec_server.config import DecoderKind, ServerConfig
-from mec_server.proxies import FORWARDED
+from mec_server.guard import FORWARDED
 from mec_server.server import EdgeServer
 from rfcore.errors import InvalidInput
 from rfcore.wire.conventions import STREAM_METHOD

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from rfcore.field import FieldStore
-from rfcore.wire.publish import Ground, publish, roll_back
-from rfcore.wire.tile_manifest import MANIFEST
+from rfcore.wire.tile_manifest import MANIFEST, Ground, publish, roll_back
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 

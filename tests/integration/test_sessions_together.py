@@ -15,8 +15,8 @@ from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outc
 from cav_agent.session import AgentSession
 from mec_server.session import DecodeJob, OpenJob, ServerSession
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import InvalidInput
 from rfcore.views import PosedPicture

@@ -17,8 +17,7 @@ import pytest
 from mec_server.tile_history import Learnt, TileHistory
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import rgb_from_bytes
-from rfcore.wire.publish import Ground, publish
-from rfcore.wire.tile_manifest import VersionLabel
+from rfcore.wire.tile_manifest import Ground, VersionLabel, publish
 from rfcore.wire.twin_client import AsyncTwinClient
 from rfcore.wire.twin_render import ViewRequest
 from rfedge.twin import server_source

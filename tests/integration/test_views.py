@@ -23,7 +23,7 @@ from rfcore.errors import LimitExceeded
 from rfcore.field import save_field
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.messages import Frame
-from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import Ground, publish
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_client import TwinClient

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.latency.run import WINDOW, FrameWork, play, show
-from rfcore.link import DirectionPlan, LinkProfile
+from rfcore.link.plan import DirectionPlan
+from rfcore.link.shaper import LinkProfile
 
 QUICK = DirectionPlan(LinkProfile(1e12))
 works = st.builds(FrameWork, st.integers(100, 50_000), st.floats(0.0, 400.0), st.floats(0.0, 400.0))

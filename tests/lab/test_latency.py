@@ -17,7 +17,8 @@ from lab.latency.run import (
     run_latency,
 )
 from rfcore.errors import InvalidInput
-from rfcore.link import DirectionPlan, LinkProfile
+from rfcore.link.plan import DirectionPlan
+from rfcore.link.shaper import LinkProfile
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rfcore.link import LinkPlan
-from rfcore.link.plan import read_link
+from rfcore.link.plan import LinkPlan, read_link
 
 PLAIN = "rate_mbps = 1.0\n"
 

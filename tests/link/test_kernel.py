@@ -21,7 +21,8 @@ import numpy as np
 import pytest
 
 from namespaces import Wire, connected, require, run, within
-from rfcore.link import Arrival, LinkProfile, delivery_times
+from rfcore.link.plan import Arrival, delivery_times
+from rfcore.link.shaper import LinkProfile
 from rfedge.link.proxy import LinkProxy, ProxySettings
 
 pytestmark = [pytest.mark.slow, pytest.mark.netns]

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from rfcore.errors import InvalidData, InvalidInput
-from rfcore.link import LinkPlan
-from rfcore.link.plan import read_link
+from rfcore.link.plan import LinkPlan, read_link
 
 SAMPLES = Path(__file__).parents[2] / "samples" / "links"
 

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.link import DirectionPlan, LinkProfile
+from rfcore.link.plan import DirectionPlan
+from rfcore.link.shaper import LinkProfile
 from rfedge.link.direction import Direction
 from rfedge.link.proxy import LinkProxy, ProxySettings, Side
 

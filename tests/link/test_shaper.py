@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.errors import InvalidInput
-from rfcore.link import Arrival, Link, LinkProfile, delivery_times
-from rfcore.link.shaper import BusyMeter
+from rfcore.link.plan import Arrival, delivery_times
+from rfcore.link.shaper import BusyMeter, Link, LinkProfile
 
 profiles = st.builds(
     LinkProfile,

@@ -10,10 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.errors import InvalidData, InvalidInput
-from rfcore.link import Arrival, DirectionPlan, LinkPlan, LinkProfile, delivery_times
-from rfcore.link.impairments import Jitter, JitterDistribution, Outage, RandomOutage
-from rfcore.link.plan import Impairment
-from rfcore.link.shaper import ConstantRate, LinkParts
+from rfcore.link.plan import (
+    Arrival,
+    DirectionPlan,
+    Impairment,
+    Jitter,
+    JitterDistribution,
+    LinkPlan,
+    Outage,
+    RandomOutage,
+    delivery_times,
+)
+from rfcore.link.shaper import ConstantRate, LinkParts, LinkProfile
 from rfcore.link.traces import CapacityTrace, DelayTrace, read_cicv5g
 
 SAMPLES = Path(__file__).parents[2] / "samples" / "links"

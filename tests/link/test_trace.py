@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.errors import InvalidData
-from rfcore.link import Arrival, DirectionPlan, LinkProfile, delivery_times
+from rfcore.link.plan import Arrival, DirectionPlan, delivery_times
+from rfcore.link.shaper import LinkProfile
 from rfcore.link.traces import CapacityTrace, TraceTransmission, read_mahimahi
 
 SAMPLES = Path(__file__).parents[2] / "samples" / "links"

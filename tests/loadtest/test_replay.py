@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.camera import Intrinsics, Pose
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import RejectReason
 from rfcore.wire.conventions import RENDERER_CONTRACT

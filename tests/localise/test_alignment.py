@@ -13,8 +13,8 @@ from rfcore.field import render_field_view
 from rfcore.image import I420
 from rfcore.localise.agreement import agreement_on_track
 from rfcore.localise.alignment import Aligned, Expected, Template, align
-from rfcore.localise.prior import moved
-from rfcore.localise.structure import Pyramid
+from rfcore.localise.estimate import moved
+from rfcore.localise.matching import Pyramid
 from rfcore.motion import rotation_vector
 from rfcore.views import FieldView
 

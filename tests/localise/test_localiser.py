@@ -14,6 +14,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, RadianceField, load_field, render_field_view
 from rfcore.localise.agreement import agreement, near_on_the_spot
 from rfcore.localise.alignment import Expected
+from rfcore.localise.estimate import PosePrior, moved
 from rfcore.localise.localiser import (
     Localised,
     Localiser,
@@ -22,9 +23,7 @@ from rfcore.localise.localiser import (
     Obstacle,
     median_depth,
 )
-from rfcore.localise.matching import grey
-from rfcore.localise.prior import PosePrior, moved
-from rfcore.localise.structure import Pyramid, halved, structure
+from rfcore.localise.matching import Pyramid, grey, halved, structure
 from rfcore.localise.track import Track, begin_track
 from rfcore.localise.tracker import CARRY_ALIGNMENTS, full_range
 from rfcore.motion import rotation_vector

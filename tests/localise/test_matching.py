@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.localise.estimate import moved
 from rfcore.localise.matching import (
     Features,
     Matches,
@@ -12,7 +13,6 @@ from rfcore.localise.matching import (
     match_features,
     solve_pose,
 )
-from rfcore.localise.prior import moved
 from rfcore.views import View
 
 INTRINSICS = Intrinsics(160, 120, 100.0, 90.0, 82.0, 57.0)

@@ -8,7 +8,7 @@ import pytest
 
 from rfcore.camera import Pose
 from rfcore.errors import InvalidInput
-from rfcore.localise.prior import (
+from rfcore.localise.estimate import (
     AROUND,
     MOST_RINGS,
     MOST_TURNS,

@@ -13,7 +13,7 @@ from localise.planes import INTRINSICS, WALL_M, Planes, picture
 from rfcore.camera import Camera, Pose
 from rfcore.field import FULL, Quality, Renderer, render_field_view
 from rfcore.localise.alignment import Template
-from rfcore.localise.structure import Pyramid
+from rfcore.localise.matching import Pyramid
 from rfcore.localise.track import (
     RenderAt,
     Track,

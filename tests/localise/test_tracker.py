@@ -12,11 +12,15 @@ from localise.planes import INTRINSICS, Planes, picture
 from rfcore.camera import Pose
 from rfcore.image import I420
 from rfcore.localise.agreement import agreement_on_track
-from rfcore.localise.estimate import LocalisationState, PoseEstimate, TrackerEvent
+from rfcore.localise.estimate import (
+    LocalisationState,
+    PoseEstimate,
+    PoseMeasurement,
+    TrackerEvent,
+    moved,
+)
 from rfcore.localise.localiser import Localised, Lost, Obstacle
-from rfcore.localise.matching import PnpSolution
-from rfcore.localise.prior import PoseMeasurement, moved
-from rfcore.localise.structure import Pyramid
+from rfcore.localise.matching import PnpSolution, Pyramid
 from rfcore.localise.tracker import PoseTracker
 from rfcore.motion import rotation_vector
 

@@ -20,9 +20,8 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.prediction import Prediction
-from rfcore.codec.references import Reference
+from rfcore.codec.references import Past, Reference
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
-from rfcore.codec.state import Past
 from rfcore.errors import BackendUnavailable
 from rfcore.field import Quality, SplatField, render_field_view
 from rfcore.image import I420

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mec_server.access import EVERYTHING, AccessFile, AccessList, Grant, read_access
 from rfcore.errors import AccessDenied, InvalidInput
-from rfcore.wire.identity import PeerIdentity, Role, identity_uri
+from rfcore.wire.tls import PeerIdentity, Role, identity_uri
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)
 FILE = """

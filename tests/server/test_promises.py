@@ -18,8 +18,8 @@ from mec_server.ledger.promises import (
 )
 from mec_server.session import ServerSession
 from rfcore.camera import Intrinsics
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.errors import InvalidInput, LimitExceeded
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract, Welcome

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mec_server.proxies import FORWARDED, Proxies, forwarded_auth_context
+from mec_server.guard import FORWARDED, Proxies, forwarded_auth_context
 from rfcore.errors import AccessDenied, RfedgeError
-from rfcore.wire.identity import Role, peer_identity
+from rfcore.wire.tls import Role, peer_identity
 from rfedge.certs import Members, certify
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)

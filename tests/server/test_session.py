@@ -25,7 +25,6 @@ from rfcore.errors import (
 )
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import FrameRefused
-from rfcore.wire.identity import PeerIdentity, Role, identity_uri
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -40,6 +39,7 @@ from rfcore.wire.messages import (
     StageTimes,
     Welcome,
 )
+from rfcore.wire.tls import PeerIdentity, Role, identity_uri
 
 FIELD, OTHER = "ab" * 32, "cd" * 32
 MakeFrame = Callable[..., Frame]

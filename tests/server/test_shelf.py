@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mec_server.fields.shelf import FieldShelf
+from mec_server.fields.service import FieldShelf
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field import Bounds, FieldMetadata

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Pose
-from rfcore.dataset.mounts import RIG
+from rfcore.dataset.rig import RIG
 from rfcore.errors import InvalidInput
 from streetgen import load_scene
 from streetgen.scene_file import DriveSettings, LocalisationNoise, RigSettings, Scene

@@ -21,8 +21,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.update.passes import Pass
 from rfcore.update.run import LearnAs, Update, UpdateSettings, learn
 from rfcore.views import PosedPicture
-from rfcore.wire.publish import Ground, publish
-from rfcore.wire.tile_manifest import TileVersions, read_publication
+from rfcore.wire.tile_manifest import Ground, TileVersions, publish, read_publication
 
 K = Intrinsics(96, 64, 70.0, 70.0, 48.0, 32.0)
 Paint = Callable[[int, Rgb], Rgb]

@@ -14,12 +14,10 @@ from rfcore.field.store import decode_field, encode_field
 from rfcore.harmonics import SH_DC
 from rfcore.image import Rgb
 from rfcore.raster.gaussians import Gaussians
-from rfcore.update.agreement import trusted_pixels
 from rfcore.update.colours import ColourFit, colour_layer
-from rfcore.update.passes import Pass, split_frames
-from rfcore.update.run import LearnAs, UpdateSettings, learn
+from rfcore.update.passes import Pass, split_frames, trusted_pixels
+from rfcore.update.run import LearnAs, Trial, UpdateSettings, learn, saved_percent, try_field
 from rfcore.update.splats import FineTuning, fine_tuned
-from rfcore.update.trial import Trial, saved_percent, try_field
 
 MakePass = Callable[..., Pass]
 QUICK = UpdateSettings(fine_tuning=FineTuning(120, growth=0.0))

@@ -16,24 +16,16 @@ from structlog.testing import capture_logs
 
 from mec_server.learner import RESTART_S, Learner
 from mec_server.metrics import ServerMetrics
-from mec_server.tile_history import (
-    LEARNING,
-    Learnt,
-    TileHistory,
-    read_histories,
-    write_histories,
-)
+from mec_server.tile_history import LEARNING, Learnt, TileHistory, read_histories, write_histories
 from mec_server.tile_learning import WATCH_EVERY_MS, LearningRounds
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldStore, SplatField, save_field
 from rfcore.image import Rgb
-from rfcore.update.agreement import without_outliers
-from rfcore.update.passes import Pass
+from rfcore.update.passes import Pass, without_outliers
 from rfcore.update.run import Update, UpdateSettings, learn_from
 from rfcore.update.splats import Progress
-from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import LogForm
-from rfcore.wire.tile_manifest import MANIFEST, VersionLabel
+from rfcore.wire.tile_manifest import MANIFEST, Ground, VersionLabel, publish
 from rfcore.wire.tiles import Tile, TileLight
 from tests.update.conftest import NOW, NOW_MS
 
@@ -228,8 +220,8 @@ def test_a_killed_round_publishes_nothing_half_and_the_next_does_the_work(
     at_dusk: Any, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     target = {
-        "store": "rfcore.wire.publish.FieldStore.add",
-        "manifest": "rfcore.wire.publish.write_publication",
+        "store": "rfcore.wire.tile_manifest.FieldStore.add",
+        "manifest": "rfcore.wire.tile_manifest.write_publication",
     }.get(step, f"mec_server.tile_learning.{step}")
 
     def killed(*_: object, **__: object) -> None:

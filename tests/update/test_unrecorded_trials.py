@@ -16,9 +16,8 @@ from mec_server.twin.state import ReceivedPicture
 from rfcore.field import SplatField, save_field
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.update.passes import Pass
-from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import LogForm
-from rfcore.wire.tile_manifest import VersionLabel
+from rfcore.wire.tile_manifest import Ground, VersionLabel, publish
 from tests.update.conftest import NOW, NOW_MS, K
 
 MakePass = Callable[..., Pass]

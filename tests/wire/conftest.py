@@ -5,8 +5,8 @@ import zlib
 import pytest
 
 from rfcore.camera import Intrinsics, Pose
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract

@@ -6,7 +6,6 @@ import pytest
 from every_error import every_error
 from mec_server.peers import status_of
 from rfcore.errors import RejectReason, RfedgeError
-from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.conventions import (
     CHANNEL_OPTIONS,
     MAX_MESSAGE_BYTES,
@@ -14,6 +13,7 @@ from rfcore.wire.conventions import (
     STREAM_METHOD,
 )
 from rfcore.wire.v1 import edge_pb2
+from rfcore.wire.values import MAX_PAYLOAD_BYTES
 
 
 @pytest.mark.parametrize("error", every_error(), ids=lambda e: type(e).__name__)

@@ -11,8 +11,14 @@ from rfcore.errors import FieldFormatError, InvalidInput, UnknownField
 from rfcore.field import SplatField, load_field, save_field
 from rfcore.field.layer import VOXELS_M, ColourLayer, layer_archive, layered_field
 from rfcore.raster.gaussians import Gaussians
-from rfcore.wire.publish import Ground, publish, roll_back
-from rfcore.wire.tile_manifest import MANIFEST, VersionLabel, read_publication
+from rfcore.wire.tile_manifest import (
+    MANIFEST,
+    Ground,
+    VersionLabel,
+    publish,
+    read_publication,
+    roll_back,
+)
 from rfcore.wire.tiles import MAX_LIGHTS, Area, tile_message, tile_of
 from rfedge.cli.field_tiles import FieldList, FieldPublish, FieldRollback
 

@@ -5,7 +5,7 @@ How much a coder tries is its *effort*, one name for both coders: ``fast``, ``de
 keeps its coder, because the two write different parameter sets; any frame may have another effort.
 
 Options are checked here against closed lists, because x264 ignores an option it does not know;
-``rfcore.codec.h264.header`` checks afterwards that the encoder did what it was asked.
+``rfcore.codec.h264.bitstream`` checks afterwards that the encoder did what it was asked.
 """
 
 from __future__ import annotations

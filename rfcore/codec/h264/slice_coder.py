@@ -1,6 +1,6 @@
 """Codes a picture as one H.264 slice against given pictures, without an encoder's own state.
 
-The slice refers to the parameter sets of ``rfcore.codec.h264.header``. It is a P slice of ITU-T
+The slice refers to the parameter sets of ``rfcore.codec.h264.bitstream``. It is a P slice of ITU-T
 H.264 with CABAC: skipped macroblocks, partitions of 16x16 to 8x8 with a reference each,
 quarter-sample vectors, intra modes, 4x4 and 8x8 transforms; without references an I slice. The
 kernels (``csrc/h264``) compute in integers, so the same pictures and settings give the same bytes
@@ -21,6 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.codec.h264.bitstream import (
+    DEFAULT_REFERENCES,
+    INIT_QP,
     LOG2_MAX_FRAME_NUM,
     NAL_IDR,
     NAL_P,
@@ -29,7 +31,6 @@ from rfcore.codec.h264.bitstream import (
     nal_of_rbsp,
 )
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.header import DEFAULT_REFERENCES, INIT_QP
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native

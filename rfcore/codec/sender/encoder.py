@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-from rfcore.codec.block_means import block_mean_digest
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import (
     DEFAULT_REFERENCES,
     REFERENCE_FRAMES,
@@ -19,23 +19,29 @@ from rfcore.codec.h264.config import (
     check_crf,
     check_effort,
 )
-from rfcore.codec.h264.header import StreamHeader
-from rfcore.codec.h264.pcm_picture import without_zeros
 from rfcore.codec.h264.qp_map import QpMap, check_qp_map
-from rfcore.codec.h264.splice import SpliceDecoder
-from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
+from rfcore.codec.h264.splice import SpliceDecoder, without_zeros
+from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket, block_mean_digest
 from rfcore.codec.photometric import Photometric, sent_light
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import (
     INTRA,
+    EncoderState,
+    Past,
     Reference,
     References,
     check_references,
     is_temporal,
 )
-from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.picture_coder import CodedPicture, CodingRequest, picture_coder
-from rfcore.codec.sender.rate import FittedSlice, RateModel, RateTarget, bits_curve, code_to_fit
+from rfcore.codec.sender.rate import (
+    FittedSlice,
+    FrameCosts,
+    RateModel,
+    RateTarget,
+    bits_curve,
+    code_to_fit,
+)
 from rfcore.codec.sender.reference_choice import (
     choose_photometric,
     choose_references,
@@ -43,7 +49,6 @@ from rfcore.codec.sender.reference_choice import (
     relighting_pays,
     sending_light_pays,
 )
-from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.native.yuv import digest_pair

@@ -1,6 +1,6 @@
 """Decides before a frame is coded which references it has, and under which light its render is.
 
-Both decisions rest on the estimate of D + lambda R that ``rfcore.codec.sender.frame_costs`` makes
+Both decisions rest on the estimate of D + lambda R that ``rfcore.codec.sender.rate`` makes
 for each 8x8 block. It includes no motion: pictures made from the field are aligned with the frame.
 The previous frame is not, but the coder searches motion in it, so it is taken whenever there is
 one.
@@ -13,12 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.codec.block_means import median_block_mean_difference
 from rfcore.codec.h264.config import DEFAULT_REFERENCES
+from rfcore.codec.packet import median_block_mean_difference
 from rfcore.codec.photometric import Photometric, adapt, solve
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference, References
-from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
+from rfcore.codec.sender.rate import FrameCosts, RateDistortion
 from rfcore.image import I420
 from rfcore.native.warp import BLOCK_PX
 

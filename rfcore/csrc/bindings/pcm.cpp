@@ -1,4 +1,4 @@
-// Binds picture/pcm.h. Shapes and dtypes are checked by rfcore/codec/h264/pcm_picture.py; the
+// Binds picture/pcm.h. Shapes and dtypes are checked by rfcore/codec/h264/splice.py; the
 // types below refuse anything else that nanobind can see.
 #include "picture/pcm.h"
 

@@ -1,6 +1,6 @@
 // The macroblocks of an I_PCM picture: samples in the order of ITU-T H.264, 7.3.5.
 //
-// The definition (header bytes, clamping, edges) is in rfcore/codec/h264/pcm_picture.py.
+// The definition (header bytes, clamping, edges) is in rfcore/codec/h264/splice.py.
 #pragma once
 
 #include <cstddef>

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.codec.decoder import prediction_of
 from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.references import EncoderState
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
-from rfcore.codec.state import EncoderState
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.evaluate.compare.foreground import by_macroblock, composed

@@ -32,7 +32,7 @@ from rfcore.codec.sender.ladder import Rung, TrackingEffort
 from rfcore.errors import CodecError
 from rfcore.field import Quality, RadianceField, render_field_view
 from rfcore.image import I420
-from rfcore.localise.structure import Pyramid
+from rfcore.localise.matching import Pyramid
 from rfcore.localise.track import Track, TrackingBudget, begin_track, follow_track
 from rfcore.metrics import ssim
 from rfcore.native.yuv import i420_from_rgb

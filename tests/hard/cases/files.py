@@ -14,8 +14,7 @@ from hard.cases.case import Case, Finding, refusal, statement, within
 from hard.cases.scenes import arrays_of, blobs, poisoned
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError
-from rfcore.field.ply import write_ply
-from rfcore.field.splat_file import read_splat_file
+from rfcore.field.splat_file import read_splat_file, write_ply
 from rfcore.raster.gaussians import Gaussians
 
 __all__ = ["CASES"]
