@@ -55,9 +55,7 @@ class PictureEncoder:
 
     def __init__(self) -> None:
         self._executor = ThreadPoolExecutor(1, "twin")
-        self._done: WeakKeyDictionary[
-            ReceivedPicture, dict[PictureEncoding, asyncio.Future[bytes]]
-        ] = WeakKeyDictionary()
+        self._done: WeakKeyDictionary[ReceivedPicture, Encodings] = WeakKeyDictionary()
 
     async def bytes_of(self, picture: ReceivedPicture, encoding: PictureEncoding) -> bytes:
         """Return the encoded picture."""
@@ -206,25 +204,21 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         slots: Slots,
         limits: SessionLimits,
         failed: Callable[[Exception], None],
-        access: Callable[[Context], ConsumerAccess],
+        access: Callable[[AnyContext], ConsumerAccess],
         views: ViewService,
     ) -> None:
         self._twin = twin
         self._access = access
         self._metrics = metrics
         self._views = views
-        self._pictures = PictureEncoder()
+        self.pictures = PictureEncoder()
+        """Encodes each picture once for all its users."""
         self._streams = ConsumerStreams(metrics, slots, limits.stalled_s, failed)
-        self._renders = RenderCalls(views, self._streams, limits.idle_s, access)
+        self._idle_s = limits.idle_s
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
         twin_pb2_grpc.add_TwinServiceServicer_to_server(self, server)
-
-    @property
-    def pictures(self) -> PictureEncoder:
-        """The encoder, which encodes each picture once for all its users."""
-        return self._pictures
 
     def drain(self) -> None:
         """End the stream of every consumer."""
@@ -232,19 +226,60 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
 
     def close(self) -> None:
         """Stop encoding."""
-        self._pictures.close()
+        self.pictures.close()
 
     async def Render(  # noqa: N802
-        self, request: pb.RenderRequest, context: Context
+        self, request: pb.RenderRequest, context: AnyContext
     ) -> pb.RenderResponse:
         """Return the street as it is now from one viewpoint."""
-        return await self._renders.render(request, context)
+        with await self._streams.hold(context):
+            try:
+                return rendered_view_to_wire(await self._view(request, context))
+            except RfedgeError as error:
+                await abort(context, error)
+            except Exception as error:
+                self._streams.failed(error)
+                raise
 
     async def RenderStream(  # type: ignore[override]  # noqa: N802
-        self, requests: AsyncIterator[pb.RenderStreamRequest], context: Context
+        self, requests: AsyncIterator[pb.RenderStreamRequest], context: AnyContext
     ) -> None:
-        """Return it from a viewpoint that moves, until the consumer has no more requests."""
-        await self._renders.render_stream(requests, context)
+        """Return it from a viewpoint that moves, until the consumer has no more requests.
+
+        It ends as well when the consumer asks for nothing for long or reads too slowly, and when
+        the server drains.
+        """
+        identity, _ = peer_account(context)
+        with await self._streams.hold(context):
+            async with self._streams.opened(context) as stream:
+                asked = _ViewRequests(requests, lambda: self._views.spend_message(identity))
+                try:
+                    await self._send_views(asked, stream, context)
+                except RfedgeError as error:
+                    await abort(context, error)
+                finally:
+                    asked.close()
+            if stream.end is ConsumerEnd.IDLE:
+                await context.abort(
+                    grpc.StatusCode.DEADLINE_EXCEEDED,
+                    f"no view was asked for within {self._idle_s:g} s; "
+                    "open another stream when one is",
+                )
+
+    async def _view(self, request: pb.RenderRequest, context: AnyContext) -> RenderedView:
+        access, (identity, _) = self._access(context), peer_account(context)
+        asked = view_request_from_wire(request)
+        return await self._views.view(asked, identity, access.covers, access.may_draw)
+
+    async def _send_views(
+        self, asked: _ViewRequests, stream: ConsumerStream, context: AnyContext
+    ) -> None:
+        while (request := await asked.next(stream, self._idle_s)) is not None:
+            skipped = asked.skipped
+            view = replace(await self._view(request, context), skipped=skipped)
+            answer = pb.RenderStreamResponse(view=rendered_view_to_wire(view))
+            if not await stream.write(context.write(answer)):
+                return
 
     async def Watch(  # type: ignore[override]  # noqa: N802 (a coroutine that writes will do)
         self, request: pb.WatchRequest, context: Context
@@ -256,7 +291,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
             access.check_vehicles(subscription.vehicle_ids)
         except (InvalidInput, AccessDenied) as error:
             await abort(context, error)
-        writer = _PictureWriter(self._twin, self._pictures, self._metrics, context)
+        writer = _PictureWriter(self._twin, self.pictures, self._metrics, context)
         with await self._streams.hold(context):
             async with self._streams.opened(context) as stream:
                 await writer.serve(stream, subscription, access.covers)
@@ -422,70 +457,6 @@ def picture_message(
         localisation=picture.frame.localisation,
         instant=picture.frame.instant,
     )
-
-
-class RenderCalls:
-    """Answers calls of ``TwinService`` for views; each holds a slot for as long as it lasts."""
-
-    def __init__(
-        self,
-        views: ViewService,
-        streams: ConsumerStreams,
-        idle_s: float,
-        access: Callable[[AnyContext], ConsumerAccess],
-    ) -> None:
-        self._views = views
-        self._streams = streams
-        self._idle_s = idle_s
-        self._access = access
-
-    async def render(self, request: pb.RenderRequest, context: AnyContext) -> pb.RenderResponse:
-        """Return one view, or end the call with the status of the error."""
-        with await self._streams.hold(context):
-            try:
-                return rendered_view_to_wire(await self._view(request, context))
-            except RfedgeError as error:
-                await abort(context, error)
-            except Exception as error:
-                self._streams.failed(error)
-                raise
-
-    async def render_stream(
-        self, requests: AsyncIterator[pb.RenderStreamRequest], context: AnyContext
-    ) -> None:
-        """Answer requests until the peer has no more, asks for nothing for long, reads too slowly,
-        or the server drains."""
-        identity, _ = peer_account(context)
-        with await self._streams.hold(context):
-            async with self._streams.opened(context) as stream:
-                asked = _ViewRequests(requests, lambda: self._views.spend_message(identity))
-                try:
-                    await self._follow(asked, stream, context)
-                except RfedgeError as error:
-                    await abort(context, error)
-                finally:
-                    asked.close()
-            if stream.end is ConsumerEnd.IDLE:
-                await context.abort(
-                    grpc.StatusCode.DEADLINE_EXCEEDED,
-                    f"no view was asked for within {self._idle_s:g} s; "
-                    "open another stream when one is",
-                )
-
-    async def _view(self, request: pb.RenderRequest, context: AnyContext) -> RenderedView:
-        access, (identity, _) = self._access(context), peer_account(context)
-        asked = view_request_from_wire(request)
-        return await self._views.view(asked, identity, access.covers, access.may_draw)
-
-    async def _follow(
-        self, asked: _ViewRequests, stream: ConsumerStream, context: AnyContext
-    ) -> None:
-        while (request := await asked.next(stream, self._idle_s)) is not None:
-            skipped = asked.skipped
-            view = replace(await self._view(request, context), skipped=skipped)
-            answer = pb.RenderStreamResponse(view=rendered_view_to_wire(view))
-            if not await stream.write(context.write(answer)):
-                return
 
 
 class _ViewRequests:

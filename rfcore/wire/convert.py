@@ -8,6 +8,8 @@ that concerns a single frame raises ``FrameRefused``, which holds the address to
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from google.protobuf.message import DecodeError
 
@@ -16,7 +18,7 @@ from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import InvalidInput
-from rfcore.field.quality import FULL, Quality
+from rfcore.field.quality import FULL
 from rfcore.wire.messages import (
     CameraDescription,
     ClientMessage,
@@ -97,6 +99,15 @@ def client_message_to_wire(message: ClientMessage) -> pb.StreamRequest:
     return pb.StreamRequest(frame=_frame_to_wire(message))
 
 
+@contextmanager
+def _within(field: str) -> Iterator[None]:
+    """Name the field of an ``InvalidInput`` as a part of ``field``."""
+    try:
+        yield
+    except InvalidInput as error:
+        raise InvalidInput(f"{field}.{error.field}", error.problem) from error
+
+
 def _hello_from_wire(hello: pb.Hello) -> Hello:
     check_range("hello.cameras", len(hello.cameras), 1, MAX_CAMERAS)
     check_range("hello.field_ids", len(hello.field_ids), 1, MAX_FIELDS)
@@ -119,11 +130,9 @@ def _hello_from_wire(hello: pb.Hello) -> Hello:
 
 def _camera_from_wire(field: str, camera: pb.CameraDescription) -> CameraDescription:
     k, header = camera.intrinsics, camera.codec
-    try:
+    with _within(field):
         intrinsics = intrinsics_from_wire(k)
         codec = _codec_from_wire(header)
-    except InvalidInput as error:
-        raise InvalidInput(f"{field}.{error.field}", error.problem) from error
     for side in ("width_px", "height_px"):
         if getattr(header, side) != getattr(k, side):
             raise InvalidInput(
@@ -142,10 +151,8 @@ def _camera_from_wire(field: str, camera: pb.CameraDescription) -> CameraDescrip
 def _extrinsics_from_wire(field: str, camera: pb.CameraDescription) -> Pose | None:
     if not camera.HasField("camera_from_rig"):
         return None
-    try:
+    with _within(field):
         pose = pose_from_wire(camera.camera_from_rig)
-    except InvalidInput as error:
-        raise InvalidInput(f"{field}.{error.field}", error.problem) from error
     for axis, metres in zip("xyz", pose.translation_m, strict=True):
         check_range(f"{field}.{axis}_m", metres, -MAX_LEVER_ARM_M, MAX_LEVER_ARM_M)
     return pose
@@ -198,24 +205,19 @@ def _frame_or_refusal(frame: pb.Frame) -> Frame:
 
 def _frame_from_wire(frame: pb.Frame) -> Frame:
     check_range("frame.capture_time_ns", frame.capture_time_ns, 0, 2**63 - 1)
+    with _within("frame"):
+        quality = quality_from_wire(frame.quality) if frame.HasField("quality") else FULL
     return Frame(
         check_name("frame.camera_id", frame.camera_id),
         frame.capture_time_ns,
         _pose_from_wire(frame),
         check_absent_or("frame.field_id_prefix", frame.field_id_prefix, FIELD_ID_PREFIX_BYTES),
         _packet_from_wire(frame),
-        _quality_from_wire(frame.quality) if frame.HasField("quality") else FULL,
+        quality,
         clock_from_wire(frame.capture_clock),
         localisation_from_wire(frame.localisation),
         frame.instant,
     )
-
-
-def _quality_from_wire(quality: pb.Quality) -> Quality:
-    try:
-        return quality_from_wire(quality)
-    except InvalidInput as error:
-        raise InvalidInput(f"frame.{error.field}", error.problem) from error
 
 
 def _pose_from_wire(frame: pb.Frame) -> Pose | None:
