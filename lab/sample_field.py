@@ -18,7 +18,8 @@ from rfcore.errors import InvalidData
 from rfcore.field import SplatField
 from rfcore.field.store import encode_field
 from rfcore.files import write_whole
-from rfcore.train import Bands, DensityControl, SplatTrainingConfig
+from rfcore.train.schedule import Bands, DensityControl
+from rfcore.train.splats import SplatTrainingConfig
 from rfedge.demo.field import manifest_digest, sample_field_path, trained_field
 from rfedge.program import run_program
 from rfedge.results import Provenance, make_result, provenance, write_result

@@ -14,7 +14,7 @@ from enum import StrEnum
 from functools import cached_property, partial
 
 import structlog
-from prometheus_client import CollectorRegistry, Counter
+from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
@@ -24,10 +24,10 @@ from mec_server.ledger.budgets import HELD, SPENT, Limit
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.peer_log import LogLimiter
 from mec_server.tile_history import TileHistory
-from rfcore.codec.references import References, references_name
+from rfcore.codec.references import references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
-from rfcore.wire.instruments import DurationSeries, Family, Instruments
+from rfcore.wire.instruments import Family, Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
 from rfcore.wire.tiles import Tile
 
@@ -223,7 +223,6 @@ class ServerMetrics:
             "Pictures reconstructed, by the tile of their field; empty: of none.",
             ("tile",),
         )
-        self._of_tile: dict[str, tuple[Counter, Counter]] = {}
         self._tile_of: dict[str, str] = {}
         self._published_tile_of: dict[str, str] = {}
         self._lights = make.gauge(
@@ -324,13 +323,8 @@ class ServerMetrics:
     def count_picture(self, field_id: str, payload_bytes: int) -> None:
         """Count a reconstructed picture for the tile that publishes its field."""
         tile = self._tile_of.get(field_id, "")
-        counters = self._of_tile.get(tile)
-        if counters is None:
-            counters = self._tile_payload.labels(tile), self._tile_pictures.labels(tile)
-            self._of_tile[tile] = counters
-        payload, pictures = counters
-        payload.inc(payload_bytes)
-        pictures.inc()
+        self._tile_payload.labels(tile).inc(payload_bytes)
+        self._tile_pictures.labels(tile).inc()
 
     def count_lost_decoder(self, cause: LossCause) -> None:
         """Count a decoder process that died in use."""
@@ -368,40 +362,30 @@ class ServerMetrics:
 
 
 class VehicleMetrics:
-    """The server's metrics with the labels of one stream filled in.
-
-    The series of each label value is looked up once: a frame is counted in a dozen of them, and
-    looking one up takes as long as counting.
-    """
+    """The server's metrics with the labels of one stream filled in."""
 
     def __init__(self, metrics: ServerMetrics, vehicle_id: str) -> None:
         self._metrics = metrics
         self._vehicle_id = vehicle_id
         self._label = (vehicle_id,) if metrics.per_vehicle else ()
-        self._references: dict[References, tuple[Counter, Counter]] = {}
-        self._frames: dict[tuple[str, str], Counter] = {}
 
     def received(self, frame: Frame, packet_bytes: int) -> None:
         """Count a frame that could be parsed."""
         packet = frame.packet
-        counters = self._references.get(packet.references)
-        if counters is None:
-            counters = self._references[packet.references] = self._references_counters(
-                packet.references
-            )
-        payload, coded = counters
+        labels = (*self._label, references_name(packet.references))
         self._received.inc(packet_bytes)
-        payload.inc(len(packet.payload))
-        coded.inc()
+        self._metrics.payload.labels(*labels).inc(len(packet.payload))
+        self._metrics.coded.labels(*labels).inc()
 
     def answered(self, messages: Iterable[ServerMessage]) -> None:
         """Count the frames that ``messages`` answer."""
         for message in messages:
             if isinstance(message, Ack):
-                self._frames_counter("acked", "").inc()
+                self._metrics.frames.labels(*self._label, "acked", "").inc()
                 self._metrics.observe_stages(message.times)
             elif isinstance(message, Nack):
-                self._frames_counter("nacked", str(message.reason)).inc(message.count)
+                labels = (*self._label, "nacked", message.reason)
+                self._metrics.frames.labels(*labels).inc(message.count)
 
     def reconstructed(self, latency_s: float) -> None:
         """Observe the age of a picture when it was reconstructed."""
@@ -417,19 +401,9 @@ class VehicleMetrics:
         return received.labels(*self._label) if self._label else received
 
     @cached_property
-    def _latency(self) -> DurationSeries:
-        return self._metrics.latency.labels(*self._label)
-
-    def _references_counters(self, references: References) -> tuple[Counter, Counter]:
-        labels = (*self._label, references_name(references))
-        return self._metrics.payload.labels(*labels), self._metrics.coded.labels(*labels)
-
-    def _frames_counter(self, result: str, reason: str) -> Counter:
-        counter = self._frames.get((result, reason))
-        if counter is None:
-            counter = self._metrics.frames.labels(*self._label, result, reason)
-            self._frames[result, reason] = counter
-        return counter
+    def _latency(self) -> Histogram:
+        latency = self._metrics.latency
+        return latency.labels(*self._label) if self._label else latency
 
 
 class ReadCounter(Collector):

@@ -11,7 +11,7 @@ import pytest
 from rfcore.native.backend import available_isas
 
 if TYPE_CHECKING:
-    from rfcore.raster.opencl import Device
+    from rfcore.raster.opencl.device import Device
 
 DEVICE = os.environ.get("RFEDGE_TEST_OPENCL", "Portable")
 """Name of the OpenCL device that tests draw on: PoCL (OpenCL on the CPU), or another.
@@ -31,9 +31,8 @@ GUARDED = "guarded"
 
 def opened(isa: str) -> Device:
     """Return an opened device; ``GUARDED``: the tests' in that build."""
-    from rfcore.raster.opencl import open_device
     from rfcore.raster.opencl.device import BUILDS, build_device, find_device
-    from rfcore.raster.opencl.self_check import check_device
+    from rfcore.raster.opencl.self_check import check_device, open_device
 
     if isa != GUARDED:
         return open_device(isa.partition(":")[2])

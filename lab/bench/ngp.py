@@ -23,7 +23,7 @@ from rfcore.field import NgpField, load_field
 from rfcore.metrics import psnr
 from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.shape import NgpParameters
-from rfcore.train import NgpTrainer, NgpTrainingConfig
+from rfcore.train.ngp import NgpTrainer, NgpTrainingConfig
 from rfcore.views import PosedPicture
 from rfedge.samples import sample_path
 from rfedge.timing import median_ms

@@ -63,7 +63,7 @@ def opencl_rows(isa: str) -> list[OpenClRow]:
     Raises ``BackendUnavailable`` for a device that is missing or refused, and ``RfedgeError`` where
     a byte differs from the CPU's or the device is lost.
     """
-    from rfcore.raster.opencl import open_device
+    from rfcore.raster.opencl.self_check import open_device
 
     gaussians = street_gaussians()
     description = open_device(isa.partition(":")[2]).description

@@ -41,22 +41,6 @@ from rfcore.files import DECODED_BYTES, write_whole
 from rfcore.geodesy import Anchor, anchor_values
 from rfcore.raster.renderers import is_opencl
 
-__all__ = [
-    "FIELD_ID",
-    "READERS",
-    "FieldFile",
-    "FieldStore",
-    "OpenBase",
-    "anchored_file",
-    "decode_beginning",
-    "decode_field",
-    "encode_field",
-    "load_checked",
-    "load_field",
-    "save_field",
-]
-
-
 OpenBase = Callable[[str], RadianceField]
 """Opens the base of a layer or delta by its id; raises ``UnknownField``."""
 

@@ -57,6 +57,7 @@ from rfcore.link.shaper import (
     LinkProfile,
     Transmission,
 )
+from rfcore.link.traces import parse_recording
 from rfcore.tables import Range, Table, shortened
 
 Window = tuple[float, float]
@@ -316,7 +317,7 @@ def read_link(path: Path) -> LinkPlan:
     """Read a profile.
 
     >>> from pathlib import Path
-    >>> from rfcore.link import read_link
+    >>> from rfcore.link.plan import read_link
     >>> plan = read_link(Path("samples/links/tunnel.toml"))
     >>> plan.uplink.profile.rate_bps, [impairment.name for impairment in plan.uplink.impairments]
     (10000000.0, ['outage'])
@@ -367,9 +368,7 @@ def _direction(table: Table, folder: Path, seed: str) -> DirectionPlan:
 
 
 def _impairment(name: str, table: Table, folder: Path) -> Any:
-    """Return what the table of that name declares; only what a profile names is imported."""
+    """Return what the table of that name declares."""
     if name in ("trace", "delay_trace"):
-        from rfcore.link.traces import parse_recording
-
         return parse_recording(name, table.table(name), folder)
     return parse_impairment(name, table.table(name))

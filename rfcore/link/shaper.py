@@ -115,7 +115,7 @@ class Link(Generic[Item]):
 
     ``parts`` are a constant rate unless given. 1000 bytes take 1 s at 8 kbit/s, and 0.5 s more:
 
-    >>> from rfcore.link import Link, LinkProfile
+    >>> from rfcore.link.shaper import Link, LinkProfile
     >>> link = Link(LinkProfile(rate_bps=8000, delay_s=0.5))
     >>> link.push("a frame", 1000, now=10.0).due_s
     11.5

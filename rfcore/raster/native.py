@@ -33,7 +33,8 @@ from rfcore.raster.renderers import DEVICES, is_opencl
 from rfcore.views import FieldView, HeldFieldView, View
 
 if TYPE_CHECKING:
-    from rfcore.raster.opencl import DeviceRasterizer, DrawnPlane, LentBuffer
+    from rfcore.raster.opencl.device import LentBuffer
+    from rfcore.raster.opencl.renderer import DeviceRasterizer, DrawnPlane
 
 log = structlog.get_logger()
 
@@ -94,7 +95,7 @@ def check_renderer(threads: int, isa: str | None) -> str:
     """
     if isa is None or not is_opencl(isa):
         return check_backend(threads, isa)
-    from rfcore.raster.opencl import open_device
+    from rfcore.raster.opencl.self_check import open_device
 
     check_backend(threads, None)
     open_device(isa.partition(":")[2])
@@ -225,7 +226,7 @@ class Rasterizer:
         """Run ``draw`` on the device; return False if there is none or it cannot."""
         if self._device is None:
             return False
-        from rfcore.raster.opencl import DeviceFull, DeviceLost
+        from rfcore.raster.opencl.device import DeviceFull, DeviceLost
 
         with self._lock:
             if self._device is None:  # lost while another picture was drawn
@@ -242,7 +243,9 @@ class Rasterizer:
         return True
 
     def _move_to_device(self) -> None:
-        from rfcore.raster.opencl import DeviceLost, DeviceRasterizer, open_device
+        from rfcore.raster.opencl.device import DeviceLost
+        from rfcore.raster.opencl.renderer import DeviceRasterizer
+        from rfcore.raster.opencl.self_check import open_device
 
         assert self._gaussians is not None
         device = open_device(self.isa.partition(":")[2])
@@ -295,7 +298,7 @@ class _PlaneOnDevice:
         earlier, depth = other._lent(), self._lent()  # stay as they are while they are held here
         if earlier is None or depth is None:
             return None
-        from rfcore.raster.opencl import DeviceWarp
+        from rfcore.raster.opencl.renderer import DeviceWarp
 
         warp = DeviceWarp(previous, minus, before, now, earlier, depth)
         out = I420.empty(now.render.size_px)

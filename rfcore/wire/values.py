@@ -21,8 +21,8 @@ from google.protobuf.message import Message
 from rfcore.camera import Intrinsics, Pose, Vec3
 from rfcore.codec.references import Reference, References
 from rfcore.errors import InvalidInput
+from rfcore.field.folder import FIELD_ID
 from rfcore.field.quality import Quality
-from rfcore.field.store import FIELD_ID
 from rfcore.localise.estimate import LocalisationState
 from rfcore.wire.v1 import edge_pb2 as pb
 

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from rfcore.dataset import Dataset
     from rfcore.field import RadianceField
-    from rfcore.train import NgpTrainingConfig, SplatTrainingConfig
+    from rfcore.train.ngp import NgpTrainingConfig
+    from rfcore.train.splats import SplatTrainingConfig
     from rfedge.datasets.convert import SplitTile
     from rfedge.jobs import Job, Tell
     from rfedge.training.run import Trained, TrainingJob
@@ -300,7 +301,8 @@ class Train:
 
     def _config(self, exposure_varies: bool) -> SplatTrainingConfig | NgpTrainingConfig:
         from rfcore.errors import InvalidInput
-        from rfcore.train import Bands, DensityControl, NgpTrainingConfig
+        from rfcore.train.ngp import NgpTrainingConfig
+        from rfcore.train.schedule import Bands, DensityControl
         from rfedge.training.run import UNLIMITED_ITERATIONS, training_config
 
         iterations = UNLIMITED_ITERATIONS if self.minutes is not None else self.iterations

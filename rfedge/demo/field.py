@@ -17,8 +17,8 @@ from rich.console import Console
 from rfcore.dataset import read_dataset, verify_manifest
 from rfcore.errors import DatasetError, FieldFormatError
 from rfcore.field import SplatField, load_field, save_field
-from rfcore.train import SplatTrainingConfig
 from rfcore.train.levels import LevelFitConfig
+from rfcore.train.splats import SplatTrainingConfig
 from rfedge.training.finish import SizeGoal, finish_field
 from rfedge.training.run import TrainingJob, train_field
 

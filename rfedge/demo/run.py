@@ -22,7 +22,7 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, load_field, render_field_view
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import rgb_from_i420
-from rfcore.train import SplatTrainingConfig
+from rfcore.train.splats import SplatTrainingConfig
 from rfedge.demo.field import FieldChoice, choose_field
 from rfedge.demo.measure import (
     DriveFigures,

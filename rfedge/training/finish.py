@@ -30,8 +30,8 @@ from rfcore.field.quality import LevelsOfDetail
 from rfcore.field.splat_grid import FINEST, Grain, Steps
 from rfcore.field.store import encode_field
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train import held_out_quality
 from rfcore.train.levels import LevelFitConfig, fitted, with_levels
+from rfcore.train.trainer import held_out_quality
 from rfcore.update.passes import SeenFrame, spread
 from rfcore.update.run import Trial, saved_percent, try_field
 from rfcore.views import PosedPicture

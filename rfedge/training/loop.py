@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField
-from rfcore.train import FieldTrainer, read_checkpoint, write_checkpoint
+from rfcore.train.trainer import FieldTrainer, read_checkpoint, write_checkpoint
 from rfedge.arguments import time_text
 
 __all__ = ["LoopLimits", "LoopStatus", "TrainingLoop", "run_showing"]

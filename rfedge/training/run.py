@@ -30,19 +30,11 @@ from rfcore.field import RadianceField, SplatField
 from rfcore.files import write_whole
 from rfcore.image import Rgb
 from rfcore.ngp.shape import FEATURES
-from rfcore.train import (
-    FieldTrainer,
-    HeldOut,
-    NgpModel,
-    NgpTrainer,
-    NgpTrainingConfig,
-    SplatTrainer,
-    SplatTrainingConfig,
-    held_out_quality,
-    mean_psnr_db,
-)
+from rfcore.train.ngp import NgpModel, NgpTrainer, NgpTrainingConfig
 from rfcore.train.poses import PoseCorrection, align_pictures
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.train.start import random_points
+from rfcore.train.trainer import FieldTrainer, HeldOut, held_out_quality, mean_psnr_db
 from rfcore.views import PosedPicture
 from rfedge.results import make_result, provenance
 from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing

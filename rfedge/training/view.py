@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 from rfcore.errors import RfedgeError
 from rfcore.field import save_field
-from rfcore.train import FieldTrainer
+from rfcore.train.trainer import FieldTrainer
 from rfedge.processes import service
 from rfedge.twin.web import WebSettings
 

@@ -12,7 +12,7 @@ from rfcore.dataset import write_manifest
 from rfcore.errors import DatasetError, FieldFormatError, InvalidData
 from rfcore.field import SplatField, load_field
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train import SplatTrainingConfig
+from rfcore.train.splats import SplatTrainingConfig
 from rfedge.demo.field import FieldChoice, cache_path, choose_field, sample_field_path
 from rfedge.results import provenance
 

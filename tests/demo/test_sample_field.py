@@ -11,7 +11,9 @@ from lab.sample_field import MAX_BYTES
 from rfcore.dataset import read_dataset
 from rfcore.field import Quality, SplatField, load_field
 from rfcore.field.store import encode_field
-from rfcore.train import DensityControl, SplatTrainingConfig, mean_psnr_db
+from rfcore.train.schedule import DensityControl
+from rfcore.train.splats import SplatTrainingConfig
+from rfcore.train.trainer import mean_psnr_db
 from rfedge.demo.field import check_sample_field, sample_field_path
 from rfedge.training.run import TrainingJob, train_field
 

@@ -95,7 +95,8 @@ async def test_a_device_removed_under_a_server_costs_no_frame(
     serve: Any, travel: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of six pictures the device draws two and fails in the third."""
-    from rfcore.raster.opencl import DeviceLost, DeviceRasterizer
+    from rfcore.raster.opencl.device import DeviceLost
+    from rfcore.raster.opencl.renderer import DeviceRasterizer
 
     draw, left = DeviceRasterizer.draw_codec_picture, iter(range(2))
 

@@ -13,7 +13,7 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
-from rfcore.raster.opencl import open_device
+from rfcore.raster.opencl.self_check import open_device
 from rfcore.views import View
 from rfedge.results import write_result
 

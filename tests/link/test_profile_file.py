@@ -37,20 +37,6 @@ def test_the_sample_traces_are_what_their_generator_makes(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("profile", "named"),
-    [("steady", []), ("drive", ["impairments", "traces"]), ("tunnel", ["impairments"])],
-)
-def test_only_what_a_profile_names_is_imported(profile: str, named: list[str]) -> None:
-    code = (
-        "import sys; from pathlib import Path; from rfcore.link import read_link;"
-        f"read_link(Path({str(SAMPLES / (profile + '.toml'))!r}));"
-        "print(*[m for m in ('impairments', 'traces') if 'rfcore.link.' + m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == named
-
-
-@pytest.mark.parametrize(
     ("uplink", "end", "problem"),
     [
         ("", "", "uplink.rate_mbps: is missing"),

@@ -9,8 +9,8 @@ from forward_isas import DEVICE, WORST_CASE, forward_isas
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.native.backend import available_isas
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.opencl import Device, self_check
-from rfcore.raster.opencl.device import BUILDS, Build, build_device, find_device
+from rfcore.raster.opencl import self_check
+from rfcore.raster.opencl.device import BUILDS, Build, Device, build_device, find_device
 from rfcore.raster.opencl.self_check import check_device
 
 SceneMaker = Callable[..., Gaussians]

@@ -17,8 +17,8 @@ from rfcore.native.backend import available_isas
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
-from rfcore.raster.opencl import Device, DeviceRasterizer, open_device
-from rfcore.raster.opencl.device import Build, build_device, find_device
+from rfcore.raster.opencl.device import Build, Device, build_device, find_device
+from rfcore.raster.opencl.renderer import DeviceRasterizer
 from rfcore.raster.opencl.self_check import (
     ARITHMETIC_DIGESTS,
     CHECKS,
@@ -30,6 +30,7 @@ from rfcore.raster.opencl.self_check import (
     check_device,
     check_gaussians,
     digest,
+    open_device,
 )
 from rfcore.raster.renderers import DEVICES
 from rfcore.views import FieldView, View

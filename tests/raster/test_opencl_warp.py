@@ -28,8 +28,8 @@ from rfcore.image import I420
 from rfcore.motion import quaternion_from_vector
 from rfcore.native.warp import correct_i420, warp_i420
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.opencl import DeviceRasterizer
 from rfcore.raster.opencl.device import BUILDS, build_device, find_device
+from rfcore.raster.opencl.renderer import DeviceRasterizer
 from rfcore.raster.opencl.self_check import WARP_CASES, WarpCase, carried_on, check_device
 from rfcore.views import FieldView, HeldFieldView
 

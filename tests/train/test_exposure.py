@@ -7,8 +7,10 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.raster.trainable import Exposure, LearningRates, TrainableRasterizer
-from rfcore.train import Bands, SplatTrainer, SplatTrainingConfig, mean_psnr_db
+from rfcore.train.schedule import Bands
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.train.targets import ExposureModel
+from rfcore.train.trainer import mean_psnr_db
 
 CONFIG = SplatTrainingConfig(gaussians=400, iterations=600, bands=Bands(degree=0))
 

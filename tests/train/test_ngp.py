@@ -9,16 +9,8 @@ import pytest
 from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.field import NgpField
-from rfcore.train import (
-    HeldOut,
-    NgpModel,
-    NgpSchedule,
-    NgpTrainer,
-    NgpTrainingConfig,
-    mean_psnr_db,
-    read_checkpoint,
-    write_checkpoint,
-)
+from rfcore.train.ngp import NgpModel, NgpSchedule, NgpTrainer, NgpTrainingConfig
+from rfcore.train.trainer import HeldOut, mean_psnr_db, read_checkpoint, write_checkpoint
 from rfcore.views import PointCloud
 
 SMALL = NgpModel(

@@ -14,7 +14,6 @@ from rfcore.field import SplatField
 from rfcore.motion import quaternion_from_vector
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.trainable import TrainableRasterizer
-from rfcore.train import Bands, SplatTrainer, SplatTrainingConfig
 from rfcore.train.poses import (
     PoseModel,
     align_pictures,
@@ -22,6 +21,8 @@ from rfcore.train.poses import (
     pose_gradient,
     typical_depth_m,
 )
+from rfcore.train.schedule import Bands
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.views import PosedPicture
 
 K = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)

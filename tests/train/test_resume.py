@@ -7,15 +7,9 @@ import numpy as np
 import pytest
 
 from rfcore.errors import FieldFormatError, InvalidInput
-from rfcore.train import (
-    Bands,
-    DensityControl,
-    Regularisation,
-    SplatTrainer,
-    SplatTrainingConfig,
-    read_checkpoint,
-    write_checkpoint,
-)
+from rfcore.train.schedule import Bands, DensityControl, Regularisation
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
+from rfcore.train.trainer import read_checkpoint, write_checkpoint
 
 PLAIN = SplatTrainingConfig(gaussians=200, iterations=40)
 EVERYTHING = replace(

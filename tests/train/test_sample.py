@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from rfcore.dataset import read_dataset
-from rfcore.train import SplatTrainer, SplatTrainingConfig, mean_psnr_db
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
+from rfcore.train.trainer import mean_psnr_db
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 

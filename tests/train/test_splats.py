@@ -9,14 +9,9 @@ from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train import (
-    DensityControl,
-    HeldOut,
-    SplatTrainer,
-    SplatTrainingConfig,
-    TrainingProgress,
-    mean_psnr_db,
-)
+from rfcore.train.schedule import DensityControl
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
+from rfcore.train.trainer import HeldOut, TrainingProgress, mean_psnr_db
 from rfcore.views import PointCloud
 
 SHORT = SplatTrainingConfig(gaussians=300, iterations=60)

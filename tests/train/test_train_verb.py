@@ -12,7 +12,7 @@ from rich.console import Console
 from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field import load_field, save_field
-from rfcore.train import NgpModel, NgpTrainingConfig
+from rfcore.train.ngp import NgpModel, NgpTrainingConfig
 from rfedge.cli.dataset import DatasetConvert
 from rfedge.cli.train import Train
 from rfedge.training.loop import LoopLimits

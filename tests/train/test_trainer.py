@@ -8,8 +8,9 @@ import pytest
 from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.field import FieldMetadata
-from rfcore.train import Checkpoint, HeldOut, NgpTrainingConfig, SplatTrainingConfig
-from rfcore.train.trainer import FieldTrainer, settings_of
+from rfcore.train.ngp import NgpTrainingConfig
+from rfcore.train.splats import SplatTrainingConfig
+from rfcore.train.trainer import Checkpoint, FieldTrainer, HeldOut, settings_of
 
 DIGEST = "ab" * 32
 

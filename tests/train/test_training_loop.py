@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from rfcore.errors import InvalidInput, TrainingDiverged
-from rfcore.train import Checkpoint, TrainingProgress
+from rfcore.train.trainer import Checkpoint, TrainingProgress
 from rfedge.training.loop import LoopLimits, LoopStatus, TrainingLoop, run_showing
 
 

@@ -39,7 +39,8 @@ def test_more_of_anything_takes_more() -> None:
 RUN = f"""
 import numpy as np
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.train import SplatTrainer, SplatTrainingConfig, DensityControl
+from rfcore.train.schedule import DensityControl
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.views import PointCloud, PosedPicture
 # Not getrusage: what it says includes the process this one was forked from.
 status = lambda: open("/proc/self/status").read()

@@ -8,9 +8,7 @@ import urllib.request
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client import CollectorRegistry, Counter, generate_latest
 
 from lab.pages.metrics import families
 from rfcore.errors import InvalidInput, RfedgeError
@@ -66,20 +64,6 @@ def test_a_name_against_the_conventions_is_refused(name: str, text: str, problem
         Instruments(CollectorRegistry()).seconds(name, text)
 
 
-@given(st.lists(st.tuples(st.sampled_from("abc"), st.floats(0, 10)), max_size=30))
-def test_a_histogram_is_served_as_that_of_the_client_library(
-    observed: list[tuple[str, float]],
-) -> None:
-    name, text, bounds = "rfedge_x_seconds", "Time.", FRAME_BUDGET_BUCKETS_S
-    ours, theirs = CollectorRegistry(), CollectorRegistry()
-    histogram = Instruments(ours).seconds(name, text, ("stage",))
-    oracle = Histogram(name, text, ("stage",), buckets=bounds, registry=theirs)
-    for stage, seconds in observed:
-        histogram.labels(stage).observe(seconds)
-        oracle.labels(stage).observe(seconds)
-    assert served(ours) == served(theirs)
-
-
 def served(registry: CollectorRegistry) -> list[str]:
     """Return what a scrape sees, without the times of creation."""
     return [x for x in generate_latest(registry).decode().splitlines() if "_created" not in x]
@@ -95,29 +79,6 @@ def test_an_observation_at_a_bound_is_in_its_bucket_and_one_beyond_all_in_the_la
     assert f'rfedge_x_seconds_bucket{{le="{FRAME_BUDGET_BUCKETS_S[-1]}"}} 1.0' in lines
     assert 'rfedge_x_seconds_bucket{le="+Inf"} 2.0' in lines
     assert "rfedge_x_seconds_count 2.0" in lines
-
-
-def test_removed_series_are_served_no_more_and_others_stay() -> None:
-    registry = CollectorRegistry()
-    histogram = Instruments(registry).seconds("rfedge_x_seconds", "Time.", ("vehicle", "stage"))
-    for vehicle in ("cav-1", "cav-2"):
-        for stage in ("render", "decode"):
-            histogram.labels(vehicle, stage).observe(0.1)
-    histogram.remove_by_labels({"vehicle": "cav-1"})
-    text = "\n".join(served(registry))
-    assert "cav-1" not in text
-    assert text.count("rfedge_x_seconds_count") == 2
-
-
-def test_labels_of_another_number_and_a_name_twice_are_refused() -> None:
-    make = Instruments(CollectorRegistry())
-    histogram = make.seconds("rfedge_x_seconds", "Time.", ("stage",))
-    with pytest.raises(InvalidInput, match=r"metric\.labels"):
-        histogram.labels("render", "decode")
-    with pytest.raises(KeyError):
-        histogram.observe(0.1)
-    with pytest.raises(ValueError, match="Duplicated timeseries"):
-        make.seconds("rfedge_x_seconds", "Time.")
 
 
 def test_an_endpoint_serves_until_it_is_closed_and_names_a_port_in_use() -> None:

@@ -5,18 +5,3 @@ poses, ``self_check`` tests a device before it is used. Everything that decides 
 ``.cl`` files, which follow ``rfcore/csrc/raster`` and ``rfcore/csrc/picture`` operation by
 operation; the host computes only sizes.
 """
-
-from rfcore.raster.opencl.device import Device, DeviceFull, DeviceLost, LentBuffer
-from rfcore.raster.opencl.renderer import DeviceRasterizer, DeviceWarp, DrawnPlane
-from rfcore.raster.opencl.self_check import open_device
-
-__all__ = [
-    "Device",
-    "DeviceFull",
-    "DeviceLost",
-    "DeviceRasterizer",
-    "DeviceWarp",
-    "DrawnPlane",
-    "LentBuffer",
-    "open_device",
-]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rfcore.codec.references import RENDER_ONLY, References
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfcore.train import mean_psnr_db
+from rfcore.train.trainer import mean_psnr_db
 from rfedge.evaluate.clips import (
     DECIMATION,
     Clip,
