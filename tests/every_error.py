@@ -22,5 +22,6 @@ OWN_ARGUMENTS = {
 
 def every_error() -> list[RfedgeError]:
     """Return an error of each kind of ``rfcore.errors``, made as it is raised."""
-    kinds = [getattr(errors, name) for name in errors.__all__ if name != "RejectReason"]
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
+    kinds = [kind for kind in kinds if issubclass(kind, RfedgeError)]
     return [kind(*OWN_ARGUMENTS.get(kind, ("problem",))) for kind in kinds]
