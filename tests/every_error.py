@@ -10,8 +10,6 @@ from rfcore.errors import (
     TrainingDiverged,
 )
 
-__all__ = ["every_error"]
-
 OWN_ARGUMENTS = {
     InvalidInput: ("pose.rotation", "is no rotation"),
     PacketRejected: (RejectReason.CRC_MISMATCH, "of 37 bytes"),

@@ -5,8 +5,6 @@ from dataclasses import replace
 from rfedge.loadtest.plan import Load, Mode, Verdict
 from rfedge.loadtest.run import LoadRow, Run
 
-__all__ = ["load_run", "row_of"]
-
 
 def row_of(**changes: object) -> LoadRow:
     row = LoadRow(
@@ -42,7 +40,7 @@ def row_of(**changes: object) -> LoadRow:
         server_growth_mb=0.5,
         generator_lag_ms=1.0,
     )
-    return replace(row, **changes)  # type: ignore[arg-type]
+    return replace(row, **changes)
 
 
 def load_run(vehicles: int, *, held: bool, mode: Mode = Mode.RECEIVER, hz: float = 10.0) -> Run:

@@ -31,5 +31,5 @@ def uncached_stats(loader: SourceFileLoader, path: str) -> object:
     return path_stats(loader, path)
 
 
-SourceFileLoader.get_data = mutated_data  # type: ignore[method-assign,assignment]
-SourceFileLoader.path_stats = uncached_stats  # type: ignore[method-assign,assignment]
+SourceFileLoader.get_data = mutated_data
+SourceFileLoader.path_stats = uncached_stats

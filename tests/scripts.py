@@ -5,16 +5,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-__all__ = ["ROOT", "loaded"]
-
 ROOT = Path(__file__).parents[1]
 
 
 def loaded(path: str) -> Any:
     """Return the module of a program; ``path`` is that in the checkout, ``deploy/wheels.py``."""
     spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

@@ -22,11 +22,11 @@ def drawn_layers() -> list[list[str]]:
     return [[line.split("#")[0].strip() for line in block.splitlines()] for block in blocks]
 
 
-def test_the_page_draws_the_layers_that_are_enforced() -> None:
+def test_the_page_draws_the_layers_that_are_enforced():
     assert drawn_layers() == [contract["layers"] for contract in layered_contracts()]
 
 
-def test_layers_inside_a_package_name_everything_in_it() -> None:
+def test_layers_inside_a_package_name_everything_in_it():
     inside = [contract for contract in layered_contracts() if "containers" in contract]
     assert {name for contract in inside for name in contract["containers"]} >= {"rfcore", "rfedge"}
     assert all(contract["exhaustive"] for contract in inside)

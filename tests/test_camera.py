@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 
 coordinate = st.floats(-1e7, 1e7)
@@ -29,7 +29,7 @@ def matrix_of(pose: Pose) -> list[list[float]]:
 
 
 @given(poses())
-def test_a_pose_after_its_inverse_is_the_identity(pose: Pose) -> None:
+def test_a_pose_after_its_inverse_is_the_identity(pose):
     product = pose.compose(pose.inverse())
     size = 1.0 + max(map(abs, pose.translation_m))
     assert max(map(abs, product.translation_m)) < 1e-14 * size * 10
@@ -37,9 +37,7 @@ def test_a_pose_after_its_inverse_is_the_identity(pose: Pose) -> None:
 
 
 @given(poses(), st.tuples(component, component, component))
-def test_composition_acts_as_one_map_after_the_other(
-    pose: Pose, point: tuple[float, float, float]
-) -> None:
+def test_composition_acts_as_one_map_after_the_other(pose, point):
     turn = Pose((1.0, -2.0, 3.0), (0.5, 0.5, -0.5, 0.5))
     assert turn.compose(pose).apply(point) == pytest.approx(
         turn.apply(pose.apply(point)), rel=1e-12, abs=1e-6
@@ -47,13 +45,13 @@ def test_composition_acts_as_one_map_after_the_other(
 
 
 @given(poses())
-def test_a_quaternion_and_its_negative_are_the_same_rotation(pose: Pose) -> None:
+def test_a_quaternion_and_its_negative_are_the_same_rotation(pose):
     w, x, y, z = pose.rotation
     assert Pose(pose.translation_m, (-w, -x, -y, -z)).rotation_matrix() == pose.rotation_matrix()
 
 
 @given(poses())
-def test_a_pose_survives_the_way_through_its_matrix(pose: Pose) -> None:
+def test_a_pose_survives_the_way_through_its_matrix(pose):
     back = Pose.from_matrix(matrix_of(pose))
     assert back.translation_m == pose.translation_m
     for got, want in zip(back.rotation_matrix(), pose.rotation_matrix(), strict=True):
@@ -62,9 +60,7 @@ def test_a_pose_survives_the_way_through_its_matrix(pose: Pose) -> None:
 
 @pytest.mark.parametrize("angle_rad", [math.pi, math.pi - 1e-9, 1e-9, 0.0])
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
-def test_matrices_near_a_half_turn_give_a_unit_quaternion(
-    angle_rad: float, axis: tuple[int, int, int]
-) -> None:
+def test_matrices_near_a_half_turn_give_a_unit_quaternion(angle_rad, axis):
     s = math.sin(angle_rad / 2)
     pose = Pose((0, 0, 0), (math.cos(angle_rad / 2), s * axis[0], s * axis[1], s * axis[2]))
     back = Pose.from_matrix(matrix_of(pose))
@@ -72,20 +68,14 @@ def test_matrices_near_a_half_turn_give_a_unit_quaternion(
         assert got == pytest.approx(want, abs=1e-9)
 
 
-def test_a_point_on_the_axis_lands_on_the_principal_point() -> None:
+def test_a_point_on_the_axis_lands_on_the_principal_point():
     camera = Camera(Intrinsics(640, 360, 320, 320, 320, 180), Pose.identity())
     assert camera.project((0, 0, 5)) == (320, 180, 5)
     assert camera.project((1, 0, 2)) == (480, 180, 2), "x to the right"
     assert camera.project((0, 1, 2)) == (320, 340, 2), "y down"
 
 
-def test_utm_magnitudes_keep_their_millimetres_after_the_tile_origin_is_taken_off() -> None:
-    origin = TileOrigin(east_m=691_608.0, north_m=5_334_760.0, up_m=520.0)
-    pose = Pose((691_608.125, 5_334_759.5, 521.001), (1.0, 0.0, 0.0, 0.0))
-    assert origin.localise(pose).translation_m == pytest.approx((0.125, -0.5, 1.001), abs=1e-9)
-
-
-def test_resizing_keeps_the_ray_of_a_pixel() -> None:
+def test_resizing_keeps_the_ray_of_a_pixel():
     full = Intrinsics(1920, 1080, 960.0, 970.0, 955.0, 541.0)
     small = full.resized(720, 404)
     assert (0.5 * small.width_px - small.cx_px) / small.fx_px == pytest.approx(
@@ -103,10 +93,10 @@ def test_resizing_keeps_the_ray_of_a_pixel() -> None:
         ({"cx_px": math.nan}, "intrinsics.cx_px: nan"),
     ],
 )
-def test_bad_intrinsics_are_refused_by_name(change: dict[str, float], named: str) -> None:
+def test_bad_intrinsics_are_refused_by_name(change, named):
     good = {"width_px": 64, "height_px": 36, "fx_px": 32.0, "fy_px": 32.0, "cx_px": 32.0}
     with pytest.raises(InvalidInput, match=named):
-        Intrinsics(**{**good, "cy_px": 18.0, **change})  # type: ignore[arg-type]
+        Intrinsics(**{**good, "cy_px": 18.0, **change})
 
 
 @pytest.mark.parametrize(
@@ -118,22 +108,13 @@ def test_bad_intrinsics_are_refused_by_name(change: dict[str, float], named: str
         ((0, 0, 0), (0, 0, 0, 0), "norm 0"),
     ],
 )
-def test_bad_poses_are_refused_by_name(
-    translation_m: tuple[float, float, float],
-    rotation: tuple[float, float, float, float],
-    named: str,
-) -> None:
+def test_bad_poses_are_refused_by_name(translation_m, rotation, named):
     with pytest.raises(InvalidInput, match=named):
         Pose(translation_m, rotation)
 
 
-def test_a_mirrored_matrix_is_refused_as_left_handed() -> None:
-    with pytest.raises(InvalidInput, match="left-handed"):
-        Pose.from_matrix([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]])
-
-
 @given(poses())
-def test_a_rounded_pose_is_near_and_stays_as_it_is(pose: Pose) -> None:
+def test_a_rounded_pose_is_near_and_stays_as_it_is(pose):
     """Half a step of float32: 2**-25 of a number below 1, 2**-24 of any; the angle between unit
     quaternions is twice the one between them as vectors."""
     rounded = pose.rounded()
@@ -143,6 +124,6 @@ def test_a_rounded_pose_is_near_and_stays_as_it_is(pose: Pose) -> None:
     assert math.dist(rounded.rotation, pose.rotation) <= 2 * 2**-24
 
 
-def test_a_pose_beyond_float32_cannot_be_rounded() -> None:
+def test_a_pose_beyond_float32_cannot_be_rounded():
     with pytest.raises(InvalidInput, match=r"pose.translation_m"):
         Pose((1e39, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)).rounded()

@@ -33,7 +33,7 @@ def distorted(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_converted_dataset_needs_no_lens(distorted: Path, tmp_path: Path) -> None:
+def test_a_converted_dataset_needs_no_lens(distorted, tmp_path):
     line = convert_dataset(distorted, tmp_path / "out", (32, 24), slice(1, None, 2))
     assert line == f"{tmp_path / 'out'}: 2 pictures, 4 of the dataset's undistorted"
     plain, chosen = read_dataset(tmp_path / "out"), read_dataset(distorted, distortion="undistort")
@@ -45,7 +45,7 @@ def test_a_converted_dataset_needs_no_lens(distorted: Path, tmp_path: Path) -> N
         assert (found.read() == given.read()[0, 0]).all()
 
 
-def test_pictures_of_one_time_keep_it(distorted: Path, tmp_path: Path) -> None:
+def test_pictures_of_one_time_keep_it(distorted, tmp_path):
     """Several cameras take a picture at once: there is a time, but no rate."""
     content = (distorted / "transforms.json").read_text()
     (distorted / "transforms.json").write_text(content.replace('"time": 0.1', '"time": 0.2'))
@@ -55,7 +55,7 @@ def test_pictures_of_one_time_keep_it(distorted: Path, tmp_path: Path) -> None:
     assert [p.time_ns for p in dataset.pictures] == [0, 200_000_000, 200_000_000, 300_000_000]
 
 
-def test_a_fault_leaves_nothing_behind(distorted: Path, tmp_path: Path) -> None:
+def test_a_fault_leaves_nothing_behind(distorted, tmp_path):
     content = (distorted / "3.png").read_bytes()
     (distorted / "3.png").write_bytes(content[: len(content) // 2])
     with pytest.raises(DatasetError, match=r"3\.png"):
@@ -64,19 +64,19 @@ def test_a_fault_leaves_nothing_behind(distorted: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("chosen", [slice(9, None), slice(0, None, 0), slice(-1, None)])
-def test_a_choice_of_nothing_is_refused(chosen: slice, distorted: Path, tmp_path: Path) -> None:
+def test_a_choice_of_nothing_is_refused(chosen, distorted, tmp_path):
     with pytest.raises(InvalidInput, match=r"^(every|offset): "):
         convert_dataset(distorted, tmp_path / "out", None, chosen)
 
 
-def test_the_pictures_are_lossless(distorted: Path, tmp_path: Path) -> None:
+def test_the_pictures_are_lossless(distorted, tmp_path):
     convert_dataset(distorted, tmp_path / "out", None)
     assert cv2.imread(str(tmp_path / "out" / "images" / "000002.png")).shape == (48, 64, 3)
     assert (read_rgb(tmp_path / "out" / "images" / "000002.png") == 20).all()
 
 
 @pytest.mark.parametrize("text", ["", "640", "0x3", "x", "640X360", "-1x4", "9000x10", "٣x4"])
-def test_a_size_is_width_x_height(text: str) -> None:
+def test_a_size_is_width_x_height(text):
     assert parse_size("640x360") == (640, 360)
     with pytest.raises(InvalidInput, match="size: "):
         parse_size(text)

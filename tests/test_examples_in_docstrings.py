@@ -31,7 +31,7 @@ ENTRY_POINTS = [
 
 @pytest.mark.sample
 @pytest.mark.parametrize("name", ENTRY_POINTS)
-def test_the_example_of_an_entry_point_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_example_of_an_entry_point_runs(name, monkeypatch):
     monkeypatch.chdir(ROOT)
     module_name, _, attribute = name.rpartition(".")
     module = import_module(module_name)

@@ -127,7 +127,7 @@ def sources() -> Iterator[Path]:
         yield from sorted((ROOT / package).rglob("*.py"))
 
 
-def test_every_import_is_a_base_dependency_or_guarded_by_its_extra() -> None:
+def test_every_import_is_a_base_dependency_or_guarded_by_its_extra():
     wrong, guarded = [], set()
     for path in sources():
         for package, line, extra in imports_of(path.read_text(encoding="utf-8")):
@@ -156,14 +156,12 @@ def test_every_import_is_a_base_dependency_or_guarded_by_its_extra() -> None:
         ("if TYPE_CHECKING:\n    import torch", []),
     ],
 )
-def test_the_search_sees_an_import_that_is_wrong(source: str, wrong: list[str]) -> None:
+def test_the_search_sees_an_import_that_is_wrong(source, wrong):
     found = [package for package, _, extra in imports_of(source) if problem_of(package, extra)]
     assert found == wrong
 
 
-def test_a_package_that_is_missing_or_broken_is_named_with_its_extra(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_package_that_is_missing_or_broken_is_named_with_its_extra(monkeypatch, tmp_path):
     (tmp_path / "broken_package.py").write_text("raise ImportError('no libGL.so.1')")
     monkeypatch.syspath_prepend(tmp_path)
     for module in ("scipy", "scipy.stats"):  # another test may have loaded it
@@ -179,7 +177,7 @@ def test_a_package_that_is_missing_or_broken_is_named_with_its_extra(
         pytest.raises(BackendUnavailable, match=r"cannot be loaded \(no libGL.so.1\): pip install"),
         needs("eval"),
     ):
-        import broken_package  # type: ignore[import-not-found] # noqa: F401
+        import broken_package  # noqa: F401
     with pytest.raises(BackendUnavailable, match=r"^scipy is missing: .*\[eval\]'$"):
         require("eval", "numpy", "scipy")
 
@@ -234,9 +232,7 @@ DRIVE = f"empty@10={ROOT / 'samples/street/transforms_drive_empty.json'}"
         ("carla", "carla", "dataset record-carla --out made"),
     ],
 )
-def test_a_verb_says_in_one_line_which_extra_it_needs(
-    package: str, extra: str, command: str, tmp_path: Path
-) -> None:
+def test_a_verb_says_in_one_line_which_extra_it_needs(package, extra, command, tmp_path):
     done = run_hiding(package, VERB, tmp_path, *command.split())
     assert done.stderr == f"rfedge: {package} is missing: pip install 'rfedge[{extra}]'\n"
     assert done.returncode == 2
@@ -244,7 +240,7 @@ def test_a_verb_says_in_one_line_which_extra_it_needs(
 
 
 @pytest.mark.slow
-def test_services_demo_and_training_import_no_package_of_an_extra(tmp_path: Path) -> None:
+def test_services_demo_and_training_import_no_package_of_an_extra(tmp_path):
     modules = [
         *("cav_agent.__main__", "mec_server.__main__", "mec_server.decoding.process"),
         *(

@@ -8,7 +8,7 @@ import pytest
 from rfcore.files import whole_file, whole_folder, write_whole
 
 
-def test_text_and_bytes_replace_what_was_there(tmp_path: Path) -> None:
+def test_text_and_bytes_replace_what_was_there(tmp_path):
     path = tmp_path / "a.json"
     write_whole(path, b"old")
     write_whole(path, "né")
@@ -22,7 +22,7 @@ def fail_halfway(path: Path) -> None:
         raise ZeroDivisionError
 
 
-def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "a.bin"
     write_whole(path, b"old")
     with pytest.raises(ZeroDivisionError):
@@ -32,8 +32,8 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_a_file_is_on_the_disk_before_it_gets_its_name_and_its_name_before_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     synced: list[tuple[str, list[str]]] = []
 
     def noted(descriptor: int) -> None:
@@ -46,9 +46,7 @@ def test_a_file_is_on_the_disk_before_it_gets_its_name_and_its_name_before_the_e
     assert synced == [("a.bin.part", ["a.bin.part"]), (tmp_path.name, ["a.bin"])]
 
 
-def test_a_folder_is_on_the_disk_with_all_it_holds_before_it_gets_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_is_on_the_disk_with_all_it_holds_before_it_gets_its_name(tmp_path, monkeypatch):
     synced: list[tuple[str, bool]] = []
 
     def noted(descriptor: int) -> None:

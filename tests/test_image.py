@@ -1,7 +1,5 @@
 """Picture files: what is read is what was stored, and what cannot be read is said."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ def noise(height: int, width: int) -> Rgb:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 13), (64, 48)])
-def test_a_png_comes_back_byte_for_byte(size: tuple[int, int], tmp_path: Path) -> None:
+def test_a_png_comes_back_byte_for_byte(size, tmp_path):
     rgb = noise(*size)
     write_png(tmp_path / "a.png", rgb)
     assert np.array_equal(read_rgb(tmp_path / "a.png"), rgb)
@@ -23,9 +21,7 @@ def test_a_png_comes_back_byte_for_byte(size: tuple[int, int], tmp_path: Path) -
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"], "no partial file is left"
 
 
-def test_a_picture_beyond_the_budget_is_refused_before_it_is_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_picture_beyond_the_budget_is_refused_before_it_is_decoded(tmp_path, monkeypatch):
     write_png(tmp_path / "a.png", noise(64, 48))
     monkeypatch.setattr("rfcore.image.MAX_PICTURE_PX", 64 * 48 - 1)
     monkeypatch.setattr("rfcore.image.EXACT_CONVERSION", None)  # none is to get so far
@@ -33,7 +29,7 @@ def test_a_picture_beyond_the_budget_is_refused_before_it_is_decoded(
         read_rgb(tmp_path / "a.png")
 
 
-def test_a_lossless_webp_comes_back_byte_for_byte(tmp_path: Path) -> None:
+def test_a_lossless_webp_comes_back_byte_for_byte(tmp_path):
     rgb = noise(36, 64)
     cv2.imwrite(str(tmp_path / "a.webp"), rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101])
     assert np.array_equal(read_rgb(tmp_path / "a.webp"), rgb)
@@ -41,9 +37,7 @@ def test_a_lossless_webp_comes_back_byte_for_byte(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 13), (64, 48)])
 @pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (255, 153, 51), (10, 20, 200)])
-def test_a_jpeg_shows_the_colours_of_the_picture(
-    size: tuple[int, int], colour: tuple[int, int, int]
-) -> None:
+def test_a_jpeg_shows_the_colours_of_the_picture(size, colour):
     """OpenCV's reader is the oracle; two roundings to 8 bits and a quantised mean are 3 levels."""
     rgb = np.full((*size, 3), colour, np.uint8)
     seen = cv2.imdecode(np.frombuffer(jpeg_bytes(rgb), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
@@ -52,7 +46,7 @@ def test_a_jpeg_shows_the_colours_of_the_picture(
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (7, 13), (64, 48)])
-def test_planes_are_packed_and_unpacked(size_px: tuple[int, int]) -> None:
+def test_planes_are_packed_and_unpacked(size_px):
     width, height = size_px
     half = ((height + 1) // 2, (width + 1) // 2)
     rng = np.random.default_rng(3)
@@ -65,7 +59,7 @@ def test_planes_are_packed_and_unpacked(size_px: tuple[int, int]) -> None:
         I420.unpacked(size_px, packed + b"x")
 
 
-def test_a_jpeg_is_read_without_a_colour_cast(tmp_path: Path) -> None:
+def test_a_jpeg_is_read_without_a_colour_cast(tmp_path):
     """OpenCV's reader (libjpeg-turbo) is the oracle; a fifth of a level is far below rounding."""
     ramp = np.linspace(0, 255, 64 * 96 * 3).reshape(64, 96, 3).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "a.jpg"), ramp, [cv2.IMWRITE_JPEG_QUALITY, 90])
@@ -75,27 +69,27 @@ def test_a_jpeg_is_read_without_a_colour_cast(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\n"])
-def test_what_is_no_picture_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
+def test_what_is_no_picture_is_refused_by_name(content, tmp_path):
     (tmp_path / "bad.png").write_bytes(content)
     with pytest.raises(DatasetError, match=r"bad\.png: not a readable picture"):
         read_rgb(tmp_path / "bad.png")
 
 
-def test_a_missing_picture_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_missing_picture_is_refused_by_name(tmp_path):
     with pytest.raises(DatasetError, match=r"none\.png"):
         read_rgb(tmp_path / "none.png")
 
 
-def test_planes_that_do_not_belong_together_are_refused() -> None:
+def test_planes_that_do_not_belong_together_are_refused():
     half, full = np.zeros((2, 2), np.uint8), np.zeros((4, 4), np.uint8)
     I420(full, half, half)
     with pytest.raises(InvalidInput, match="chroma planes"):
         I420(full, full, half)
     with pytest.raises(InvalidInput, match="uint8"):
-        I420(full, half, half.astype(np.int16))  # type: ignore[arg-type]
+        I420(full, half, half.astype(np.int16))
 
 
-def test_a_digest_knows_pixels_planes_and_size() -> None:
+def test_a_digest_knows_pixels_planes_and_size():
     y, c = np.zeros((4, 4), np.uint8), np.zeros((2, 2), np.uint8)
     changed = c.copy()
     changed[1, 1] = 1

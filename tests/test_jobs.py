@@ -1,7 +1,6 @@
 """Lists of jobs: what is done is skipped, what fails is named, and does not stop the rest."""
 
 import os
-import re
 import signal
 from dataclasses import replace
 from functools import partial
@@ -49,19 +48,7 @@ def failing(folder: Path, name: str, work: object) -> Job:
     return Job(name, work, (folder / f"{name}.txt",), name, 1, 1 << 20)
 
 
-def test_every_line_has_its_jobs_name_and_process(tmp_path: Path) -> None:
-    told: list[str] = []
-    assert run_jobs([job(tmp_path, "a")], told.append) == 0
-    begin = "a, process "
-    assert [line.startswith(begin) for line in told] == [True, True, True, False]
-    said = [line.rpartition(": ")[2] for line in told]
-    assert said[:2] + said[3:] == ["writing", "4 letters", "done"]
-    assert re.fullmatch(r"ended after \d+\.\d\d s", said[2])
-
-
-def test_what_is_done_is_skipped_and_what_was_made_from_something_else_is_made_again(
-    tmp_path: Path,
-) -> None:
+def test_what_is_done_is_skipped_and_what_was_made_from_something_else_is_made_again(tmp_path):
     told: list[str] = []
     jobs = [job(tmp_path, "a"), job(tmp_path, "b")]
     assert run_jobs(jobs, told.append) == 0
@@ -74,14 +61,14 @@ def test_what_is_done_is_skipped_and_what_was_made_from_something_else_is_made_a
     assert run_jobs(again, told.append) == 2
 
 
-def test_a_file_that_was_removed_is_made_again(tmp_path: Path) -> None:
+def test_a_file_that_was_removed_is_made_again(tmp_path):
     run_jobs([job(tmp_path, "a")], lambda _: None)
     (tmp_path / "a.txt").unlink()
     assert run_jobs([job(tmp_path, "a")], lambda _: None) == 0
     assert (tmp_path / "a.txt").read_text() == "text"
 
 
-def test_failures_are_listed_at_the_end_and_stop_nobody(tmp_path: Path) -> None:
+def test_failures_are_listed_at_the_end_and_stop_nobody(tmp_path):
     told: list[str] = []
     jobs = [
         failing(tmp_path, "bad", refuse),
@@ -106,9 +93,7 @@ def test_failures_are_listed_at_the_end_and_stop_nobody(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_on_ray_jobs_that_fail_or_whose_workers_die_are_listed_and_stop_nobody(
-    tmp_path: Path,
-) -> None:
+def test_on_ray_jobs_that_fail_or_whose_workers_die_are_listed_and_stop_nobody(tmp_path):
     told: list[str] = []
     jobs = [
         failing(tmp_path, "bad", refuse),
@@ -132,7 +117,7 @@ def test_on_ray_jobs_that_fail_or_whose_workers_die_are_listed_and_stop_nobody(
     assert len(set(deaths)) == RETRIES + 1, "each time in another process"
 
 
-def test_a_ray_that_nobody_runs_is_an_error_at_once(tmp_path: Path, free_port: int) -> None:
+def test_a_ray_that_nobody_runs_is_an_error_at_once(tmp_path, free_port):
     address = f"127.0.0.1:{free_port}"
     with pytest.raises(RfedgeError, match=f"^no Ray at {address}: Connection refused; give the"):
         run_jobs([job(tmp_path, "a")], print, address)
@@ -140,7 +125,7 @@ def test_a_ray_that_nobody_runs_is_an_error_at_once(tmp_path: Path, free_port: i
         run_jobs([job(tmp_path, "a")], print, "ray://:")
 
 
-def test_a_job_that_fails_is_no_longer_taken_for_done(tmp_path: Path) -> None:
+def test_a_job_that_fails_is_no_longer_taken_for_done(tmp_path):
     good = job(tmp_path, "a")
     run_jobs([good], lambda _: None)
     bad = Job("a", refuse, good.outputs, "another text", 1, 1 << 20)
@@ -149,7 +134,7 @@ def test_a_job_that_fails_is_no_longer_taken_for_done(tmp_path: Path) -> None:
     assert not good.is_done
 
 
-def test_two_jobs_of_one_name_no_output_and_no_core_are_refused(tmp_path: Path) -> None:
+def test_two_jobs_of_one_name_no_output_and_no_core_are_refused(tmp_path):
     with pytest.raises(InvalidInput, match="more than one is named a"):
         run_jobs([job(tmp_path, "a"), job(tmp_path, "a")], lambda _: None)
     with pytest.raises(InvalidInput, match="job a makes no file"):
@@ -158,7 +143,7 @@ def test_two_jobs_of_one_name_no_output_and_no_core_are_refused(tmp_path: Path) 
         Job("a", refuse, (tmp_path / "a",), "", 0, 0)
 
 
-def test_a_consoles_lines_are_told_whole_and_without_colours() -> None:
+def test_a_consoles_lines_are_told_whole_and_without_colours():
     told: list[str] = []
     console = console_of(told.append)
     console.print("[bold]Training[/] a tile", end="")

@@ -5,7 +5,7 @@ import pytest
 from machine import QUIET, Host, NotQuiet, judge
 
 
-def test_what_others_took_is_a_share() -> None:
+def test_what_others_took_is_a_share():
     assert 0.0 <= Host().taken() <= 1.0
 
 
@@ -17,13 +17,11 @@ def test_what_others_took_is_a_share() -> None:
         (["late", "wrong"], ["late"], 2 * QUIET, AssertionError),
     ],
 )
-def test_only_lateness_on_a_busy_machine_is_measured_again(
-    failed: list[str], late: list[str], taken: float, raises: type[AssertionError]
-) -> None:
+def test_only_lateness_on_a_busy_machine_is_measured_again(failed, late, taken, raises):
     with pytest.raises(AssertionError) as raised:
         judge(failed, late, taken)
     assert raised.type is raises
 
 
-def test_what_is_good_is_good_on_any_machine() -> None:
+def test_what_is_good_is_good_on_any_machine():
     judge([], [], 1.0)

@@ -30,7 +30,7 @@ class Mutant:
 
 RIVALS = "rfedge/evaluate/rivals.py"
 BENCHMARK = "lab/benchmark"
-BENCHMARK_TESTS = "tests/experiments/test_benchmark.py"
+BENCHMARK_TESTS = "tests/lab/test_benchmark.py"
 MUTANTS = (
     Mutant(
         "x264 is crippled",
@@ -38,21 +38,21 @@ MUTANTS = (
         '{"preset": preset, "tune": "zerolatency", "x264-params": _joined(options)}',
         '{"preset": preset, "tune": "zerolatency", "x264-params": _joined({**options, '
         '"cabac": "0", "ref": "1", "subme": "0"})}',
-        "tests/experiments/test_rivals.py::test_a_rival_runs_with_the_options_it_is_named_for",
+        "tests/evaluate/test_rivals.py::test_a_rival_runs_with_the_options_it_is_named_for",
     ),
     Mutant(
         "x264 runs at another preset than it is named for",
         RIVALS,
         '{"preset": preset, "tune": "zerolatency", "x264-params": _joined(options)}',
         '{"preset": "superfast", "tune": "zerolatency", "x264-params": _joined(options)}',
-        "tests/experiments/test_rivals.py::test_a_rival_runs_with_the_options_it_is_named_for",
+        "tests/evaluate/test_rivals.py::test_a_rival_runs_with_the_options_it_is_named_for",
     ),
     Mutant(
         "the steady state has the first frame",
         "rfedge/evaluate/clips.py",
         "STEADY = slice(1, None)",
         "STEADY = slice(0, None)",
-        "tests/experiments/test_compare.py"
+        "tests/evaluate/test_compare.py"
         "::test_what_the_first_frame_takes_does_not_count_in_the_steady_state",
     ),
     Mutant(
@@ -60,14 +60,14 @@ MUTANTS = (
         "rfedge/evaluate/rate_curve.py",
         "starts = rng.integers(first, count - length + 1",
         "starts = rng.integers(0, count - length + 1",
-        "tests/experiments/test_rate_curve.py::test_the_first_frame_is_never_drawn",
+        "tests/evaluate/test_rate_curve.py::test_the_first_frame_is_never_drawn",
     ),
     Mutant(
         "our processor time is that of rendering",
         "rfedge/evaluate/field_coder.py",
         "both_ms = cpu_ms + render_cpu_ms, receiver",
         "both_ms = render_cpu_ms, receiver",
-        "tests/experiments/test_field_coder.py"
+        "tests/evaluate/test_field_coder.py"
         "::test_processor_time_is_coding_and_the_frames_share_of_rendering",
     ),
     Mutant(
@@ -75,7 +75,7 @@ MUTANTS = (
         "rfedge/evaluate/performance.py",
         "float(np.median([run.cpu_ms for run in runs]))",
         "float(np.max([run.cpu_ms for run in runs]))",
-        "tests/experiments/test_performance.py"
+        "tests/evaluate/test_performance.py"
         "::test_processor_time_in_turns_is_that_of_the_median_round",
     ),
     Mutant(
@@ -83,7 +83,7 @@ MUTANTS = (
         "lab/robust/lossy_link.py",
         "yield arrival if delivered or index == 0 else None",
         "yield arrival",
-        "tests/experiments/test_loss.py::test_no_frame_is_new_that_did_not_arrive",
+        "tests/lab/test_loss.py::test_no_frame_is_new_that_did_not_arrive",
     ),
     Mutant(
         "no second picture of the field is chosen",
@@ -98,21 +98,21 @@ MUTANTS = (
         RIVALS,
         '"trellis": "2", "aq-mode": "0"',
         '"trellis": "0", "aq-mode": "0"',
-        "tests/experiments/test_rivals.py::test_a_rival_runs_with_the_options_it_is_named_for",
+        "tests/evaluate/test_rivals.py::test_a_rival_runs_with_the_options_it_is_named_for",
     ),
     Mutant(
         "x264 is not tuned for the metric",
         RIVALS,
         'return replace(plain, options={**plain.options, "tune": f"zerolatency,{metric}"})',
         "return plain",
-        "tests/experiments/test_rivals.py::test_tuning_for_psnr_changes_the_stream",
+        "tests/evaluate/test_rivals.py::test_tuning_for_psnr_changes_the_stream",
     ),
     Mutant(
         "our frames cost their slices alone",
         "rfedge/evaluate/field_coder.py",
         "sizes = [message_bytes(frame.arrival, self._rendered.quality) for frame in coded]",
         "sizes = [len(frame.encoded.packet.payload) for frame in coded]",
-        "tests/experiments/test_field_coder.py::test_a_frame_costs_its_slice_and_its_header",
+        "tests/evaluate/test_field_coder.py::test_a_frame_costs_its_slice_and_its_header",
     ),
     Mutant(
         "quality is the mean of PSNRs",
@@ -120,7 +120,7 @@ MUTANTS = (
         "        psnr_db = 10 * np.log10(PEAK * PEAK / mse)",
         "        psnr_db = np.array([(10 * np.log10(PEAK * PEAK / clip.luma_mse[frames])).mean() "
         "for clip in clips])",
-        "tests/experiments/test_rate_curve.py"
+        "tests/evaluate/test_rate_curve.py"
         "::test_quality_is_the_psnr_of_the_mean_error_not_the_mean_of_psnrs",
     ),
     Mutant(
@@ -171,7 +171,7 @@ def outcome(test: str, mutant: Mutant | None) -> tuple[int, str]:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)
-def test_a_change_that_makes_figures_wrong_is_noticed(mutant: Mutant) -> None:
+def test_a_change_that_makes_figures_wrong_is_noticed(mutant):
     status, said = outcome(mutant.test, mutant)
     assert status == FAILED, said
     assert outcome(mutant.test, None)[0] == 0

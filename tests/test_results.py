@@ -85,7 +85,7 @@ def revisions_in(content: object) -> set[str]:
 
 
 @pytest.mark.parametrize("path", RECORDED, ids=lambda path: path.stem)
-def test_what_is_recorded_was_made_by_committed_code_of_this_history(path: Path) -> None:
+def test_what_is_recorded_was_made_by_committed_code_of_this_history(path):
     found = revisions_in(json.loads(path.read_text()))
     assert found
     assert not {at for at in found if not re.fullmatch(r"[0-9a-f]{7,40}", at)}
@@ -98,34 +98,34 @@ def test_what_is_recorded_was_made_by_committed_code_of_this_history(path: Path)
 # --- how it was made
 
 
-def test_a_result_written_beside_does_not_make_the_code_dirty(checkout: Path) -> None:
+def test_a_result_written_beside_does_not_make_the_code_dirty(checkout):
     clean = revision(checkout)
     (checkout / "lab/results/figure.json").write_text("2")
     assert revision(checkout) == clean
     assert len(clean) == 12
 
 
-def test_changed_code_makes_it_dirty(checkout: Path) -> None:
+def test_changed_code_makes_it_dirty(checkout):
     clean = revision(checkout)
     (checkout / "code.py").write_text("2")
     assert revision(checkout) == f"{clean}-dirty"
 
 
-def test_outside_a_checkout_it_is_unknown(tmp_path: Path) -> None:
+def test_outside_a_checkout_it_is_unknown(tmp_path):
     assert revision(tmp_path) == "unknown"
 
 
 @pytest.mark.parametrize(("at", "dirty"), [("abc", False), ("abc-dirty", True), ("unknown", None)])
-def test_the_flag_says_whether_the_code_had_changes(at: str, dirty: bool | None) -> None:
+def test_the_flag_says_whether_the_code_had_changes(at, dirty):
     assert provenance(at=at).dirty is dirty
 
 
-def test_the_command_can_be_pasted_into_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_can_be_pasted_into_a_shell(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/usr/bin/rfedge", "eval", "a b", "c'd"])
     assert provenance(at="x").command == """rfedge eval 'a b' 'c'"'"'d'"""
 
 
-def test_inputs_are_named_as_given_with_their_digests_and_folders_left_out(tmp_path: Path) -> None:
+def test_inputs_are_named_as_given_with_their_digests_and_folders_left_out(tmp_path):
     file, folder = tmp_path / "f.rff", tmp_path / "drive"
     file.write_bytes(b"field")
     folder.mkdir()
@@ -136,7 +136,7 @@ def test_inputs_are_named_as_given_with_their_digests_and_folders_left_out(tmp_p
 # --- writing and reading
 
 
-def test_a_row_comes_back_as_it_was_written(tmp_path: Path) -> None:
+def test_a_row_comes_back_as_it_was_written(tmp_path):
     path = tmp_path / "deep" / "x.json"
     write_result(path, make_result("test", MADE, {"rows": [ROW, replace(ROW, reason="none")]}))
     result = read_result(path, "test")
@@ -148,9 +148,7 @@ def test_a_row_comes_back_as_it_was_written(tmp_path: Path) -> None:
     assert second.reason == "none"
 
 
-def test_what_is_written_is_what_was_returned(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_written_is_what_was_returned(tmp_path, capsys):
     result = make_result("test", MADE, {"rows": [ROW], "out": Path("a/b")})
     write_result(tmp_path / "x.json", result)
     write_result("-", result)
@@ -165,7 +163,7 @@ def test_what_is_written_is_what_was_returned(
         max_leaves=8,
     )
 )
-def test_json_holds_every_finite_value_and_no_other(value: Any) -> None:
+def test_json_holds_every_finite_value_and_no_other(value):
     if "Infinity" in json.dumps(value) and _has_infinity(value):
         with pytest.raises(InvalidInput, match="not finite"):
             as_json(value)
@@ -190,12 +188,12 @@ def _has_infinity(value: Any) -> bool:
         ({"data": b"raw"}, r"result\.data: bytes has no form"),
     ],
 )
-def test_what_json_cannot_hold_is_named_by_its_place(content: Any, place: str) -> None:
+def test_what_json_cannot_hold_is_named_by_its_place(content, place):
     with pytest.raises(InvalidInput, match=place):
         make_result("test", MADE, content)
 
 
-def test_a_measurement_cannot_pretend_to_have_been_made_otherwise() -> None:
+def test_a_measurement_cannot_pretend_to_have_been_made_otherwise():
     with pytest.raises(InvalidInput, match="host, revision: reserved"):
         make_result("test", MADE, {"revision": "another", "host": {}, "rows": []})
 
@@ -210,21 +208,21 @@ def test_a_measurement_cannot_pretend_to_have_been_made_otherwise() -> None:
         ('{"kind": "ladder"}', "holds a result of kind 'ladder', not 'compare'"),
     ],
 )
-def test_another_file_is_refused_by_name(tmp_path: Path, text: str, problem: str) -> None:
+def test_another_file_is_refused_by_name(tmp_path, text, problem):
     path = tmp_path / "notes.json"
     path.write_text(text)
     with pytest.raises(InvalidInput, match=rf"notes\.json.*{problem}"):
         read_result(path, "compare")
 
 
-def test_a_row_of_another_shape_is_named_with_what_is_wrong() -> None:
+def test_a_row_of_another_shape_is_named_with_what_is_wrong():
     rows = [as_json(ROW), {**as_json(ROW), "colour": 1}]
     del rows[1]["by_stage"]
     with pytest.raises(InvalidInput, match="row 1 lacks by_stage and has unknown colour: Row does"):
         rows_of(Row, rows)
 
 
-def test_a_result_is_a_json_file() -> None:
+def test_a_result_is_a_json_file():
     check_result_path(Path("out/x.json"))
     with pytest.raises(InvalidInput, match=r"x\.csv must end in \.json"):
         check_result_path(Path("out/x.csv"))
@@ -234,7 +232,7 @@ def test_a_result_is_a_json_file() -> None:
 
 
 @pytest.mark.parametrize("path", RECORDED, ids=lambda path: path.stem)
-def test_a_committed_result_says_how_it_was_made(path: Path) -> None:
+def test_a_committed_result_says_how_it_was_made(path):
     result = read_result(path)
     json.dumps(result, allow_nan=False)
     assert {"command", "revision", "host"} < set(result)
@@ -242,7 +240,7 @@ def test_a_committed_result_says_how_it_was_made(path: Path) -> None:
     assert "case" not in result or result["kind"] == "bench"
 
 
-def test_no_experiment_writes_over_a_tracked_file_unless_told_to() -> None:
+def test_no_experiment_writes_over_a_tracked_file_unless_told_to():
     """Everything an experiment writes by default lies below ``out``, which is not tracked."""
     import lab.cli
 
@@ -253,12 +251,12 @@ def test_no_experiment_writes_over_a_tracked_file_unless_told_to() -> None:
         assert Path(experiment.cells).parts[0] == "out", experiment
 
 
-def test_the_host_is_described_without_a_clock() -> None:
+def test_the_host_is_described_without_a_clock():
     assert set(results.host()) == {"cpu", "cores", "isa", "python", "os"}
     assert results.host() == results.host()
 
 
-def test_several_servers_say_of_each_row_whether_its_bound_held() -> None:
+def test_several_servers_say_of_each_row_whether_its_bound_held():
     result = read_result(ROOT / "lab/results/scale.json", "scale")
     for row in result["rows"]:
         assert row["held"] == (row["measured"] <= row["bound"]), row["case"]

@@ -47,7 +47,7 @@ def table(values: object, path: str = "") -> Table:
 
 
 @pytest.mark.parametrize(("kind", "value"), [(k, v) for k, good in GOOD.items() for v in good])
-def test_a_good_value_comes_back_as_it_was_written(kind: str, value: Any) -> None:
+def test_a_good_value_comes_back_as_it_was_written(kind, value):
     taken = TAKERS[kind](table({"key": value}))
     if isinstance(taken, Table):
         assert all(taken.value(key) == value[key] for key in value)
@@ -58,7 +58,7 @@ def test_a_good_value_comes_back_as_it_was_written(kind: str, value: Any) -> Non
 
 @pytest.mark.parametrize("kind", TAKERS)
 @pytest.mark.parametrize("path", ["", "up.link"])
-def test_a_missing_key_is_named_with_its_path(kind: str, path: str) -> None:
+def test_a_missing_key_is_named_with_its_path(kind, path):
     with pytest.raises(InvalidInput, match="is missing") as caught:
         TAKERS[kind](table({"other": 1}, path))
     assert caught.value.field == ("up.link.key" if path else "key")
@@ -79,7 +79,7 @@ ALLOWED: dict[str, Callable[[Any], bool]] = {
 
 @pytest.mark.parametrize("kind", TAKERS)
 @given(value=json_values)
-def test_any_value_is_taken_as_its_kind_or_refused_by_its_key(kind: str, value: Any) -> None:
+def test_any_value_is_taken_as_its_kind_or_refused_by_its_key(kind, value):
     """Nothing of another kind gets through, and no value breaks the checker."""
     refused: list[InvalidInput] = []
     try:
@@ -91,9 +91,7 @@ def test_any_value_is_taken_as_its_kind_or_refused_by_its_key(kind: str, value: 
 
 
 @given(st.floats() | st.integers(), st.floats(-1e6, 1e6), st.floats(0, 1e6))
-def test_a_number_is_taken_exactly_if_it_is_finite_and_within(
-    value: float, low: float, span: float
-) -> None:
+def test_a_number_is_taken_exactly_if_it_is_finite_and_within(value, low, span):
     within = Range(low, low + span)
     inside = low <= value <= low + span
     assert (within.problem(value) is None) == inside
@@ -128,22 +126,20 @@ def test_a_number_is_taken_exactly_if_it_is_finite_and_within(
         ("table", [], "key", r"is \[\], not a table"),
     ],
 )
-def test_a_wrong_value_is_named_with_its_limit(
-    kind: str, value: object, field: str, problem: str
-) -> None:
+def test_a_wrong_value_is_named_with_its_limit(kind, value, field, problem):
     with pytest.raises(InvalidInput, match=problem) as caught:
         TAKERS[kind](table({"key": value}))
     assert caught.value.field == field
 
 
-def test_a_default_stands_for_a_missing_key_and_is_checked_too() -> None:
+def test_a_default_stands_for_a_missing_key_and_is_checked_too():
     assert table({}).number("key", Range(0, 1), 0.5) == 0.5
     assert table({"key": 0.25}).number("key", Range(0, 1), 0.5) == 0.25
     with pytest.raises(InvalidInput, match=r"is 2, outside 0\.\.1"):
         table({}).number("key", Range(0, 1), 2)
 
 
-def test_a_key_that_nobody_asked_for_is_refused_with_those_that_are_known() -> None:
+def test_a_key_that_nobody_asked_for_is_refused_with_those_that_are_known():
     section = table({"rate": 1, "dleay": 2}, "uplink")
     section.number("rate")
     section.number("delay", default=0.0)
@@ -152,7 +148,7 @@ def test_a_key_that_nobody_asked_for_is_refused_with_those_that_are_known() -> N
     assert caught.value.field == "uplink.dleay"
 
 
-def test_the_error_is_what_the_format_makes_of_path_and_problem() -> None:
+def test_the_error_is_what_the_format_makes_of_path_and_problem():
     def fail(path: str, problem: str) -> Exception:
         return LookupError(f"file.json at {path}, which {problem}")
 
@@ -163,11 +159,11 @@ def test_the_error_is_what_the_format_makes_of_path_and_problem() -> None:
 
 
 @given(json_values)
-def test_what_an_error_shows_of_a_value_is_one_short_line(value: Any) -> None:
+def test_what_an_error_shows_of_a_value_is_one_short_line(value):
     shown = shortened(value)
     assert len(shown) <= 63
     assert "\n" not in shown
 
 
-def test_a_number_of_too_many_digits_is_shown_by_words() -> None:
+def test_a_number_of_too_many_digits_is_shown_by_words():
     assert shortened(10**5000) == "a number of more digits than are printed"

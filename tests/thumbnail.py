@@ -10,28 +10,12 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import SplatField, save_field
 from rfcore.image import write_png
-from rfcore.raster.gaussians import Gaussians
+from tests.clouds import cloud
 
 INTRINSICS = Intrinsics(96, 64, 70.0, 70.0, 48.0, 32.0)
 FRAMES = 5
 STEP_M = 0.05
 NOISE_LEVELS = 3.0
-
-
-def wall(seed: int, count: int = 1500) -> SplatField:
-    """A wall of small splats, 4 m ahead."""
-    rng = np.random.default_rng(seed)
-    sh = np.zeros((count, 1, 3), np.float32)
-    sh[:, 0] = rng.uniform(-1.2, 1.2, (count, 3))
-    return SplatField(
-        Gaussians(
-            means=rng.uniform([-4, -3, 4], [4, 3, 4.5], (count, 3)).astype(np.float32),
-            quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-            log_scales=np.full((count, 3), np.log(0.12), np.float32),
-            opacity_logits=np.full(count, 2.0, np.float32),
-            sh=sh,
-        )
-    )
 
 
 def write_drive(folder: Path, field: SplatField, *, with_box: bool) -> Path:
@@ -69,7 +53,7 @@ class Thumbnail:
 @pytest.fixture(scope="session")
 def thumbnail(tmp_path_factory: pytest.TempPathFactory) -> Thumbnail:
     folder = tmp_path_factory.mktemp("thumbnail")
-    field = wall(1)
+    field = cloud(1, 1500, [-4, -3, 4], [4, 3, 4.5], 0.12, reach=1.2)
     save_field(field, folder / "wall.rff")
     drive = write_drive(folder / "drive", field, with_box=True)
     empty = write_drive(folder / "empty", field, with_box=False)

@@ -28,11 +28,7 @@ def transform(
 
 
 @given(at=place, angles=st.tuples(degrees, degrees, degrees), seen=ahead)
-def test_a_point_before_the_sensor_lands_on_carlas_pixel(
-    at: tuple[float, float, float],
-    angles: tuple[float, float, float],
-    seen: tuple[float, float, float],
-) -> None:
+def test_a_point_before_the_sensor_lands_on_carlas_pixel(at, angles, seen):
     """CARLA's own recipe: in the sensor, (y, -z, x) are right, down, forward.
 
     ``Transform.transform`` puts the point into the world; it works in float32, 2e-5 m at 200 m and
@@ -49,9 +45,7 @@ def test_a_point_before_the_sensor_lands_on_carlas_pixel(
 
 
 @given(at=place, angles=st.tuples(degrees, degrees, degrees))
-def test_the_axes_are_the_librarys_vectors(
-    at: tuple[float, float, float], angles: tuple[float, float, float]
-) -> None:
+def test_the_axes_are_the_librarys_vectors(at, angles):
     sensor = transform(at, angles)
     pose = pose_from_carla(sensor.get_matrix())
     right, down, forward = zip(*pose.rotation_matrix(), strict=True)
@@ -65,13 +59,13 @@ def test_the_axes_are_the_librarys_vectors(
     assert pose.translation_m == pytest.approx(point_from_carla(*at), abs=1e-4)
 
 
-def test_yaw_turns_to_the_right() -> None:
+def test_yaw_turns_to_the_right():
     """Positive yaw is clockwise from above in CARLA: from x towards y, which is our -y."""
     pose = pose_from_carla(transform((0, 0, 0), (0, 90, 0)).get_matrix())
     assert pose.apply((0, 0, 1)) == pytest.approx((0, -1, 0), abs=1e-6)
 
 
-def test_the_field_of_view_is_horizontal() -> None:
+def test_the_field_of_view_is_horizontal():
     assert (K.fx_px, K.fy_px, K.cx_px, K.cy_px) == (pytest.approx(960.0), K.fx_px, 960.0, 540.0)
     assert math.degrees(2 * math.atan(960 / intrinsics_of_fov(1920, 1080, 60).fx_px)) == (
         pytest.approx(60)

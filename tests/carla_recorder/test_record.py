@@ -3,7 +3,6 @@
 No CARLA server is run here: the stand-in answers the calls the recorder makes.
 """
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -125,7 +124,7 @@ class World:
         return self.frame
 
 
-def test_a_recording_is_a_dataset_of_all_cameras_both_ways(tmp_path: Path) -> None:
+def test_a_recording_is_a_dataset_of_all_cameras_both_ways(tmp_path):
     world = World()
     assert CarlaRecorder(carla, world, SMALL).record(tmp_path) == 2 * 3 * 18
     dataset = read_dataset(tmp_path)
@@ -135,7 +134,7 @@ def test_a_recording_is_a_dataset_of_all_cameras_both_ways(tmp_path: Path) -> No
     assert world.attributes["image_size_x"] == "32"
 
 
-def test_every_camera_looks_where_its_mount_says(tmp_path: Path) -> None:
+def test_every_camera_looks_where_its_mount_says(tmp_path):
     """The car drives along x at y = 0 and back at CARLA's y = -4, which is our +4."""
     CarlaRecorder(carla, World(), SMALL).record(tmp_path)
     found = {picture.name: picture.camera for picture in read_dataset(tmp_path).pictures}
@@ -151,7 +150,7 @@ def test_every_camera_looks_where_its_mount_says(tmp_path: Path) -> None:
     assert low.apply((0, 0, 10))[2] > low.translation_m[2] + 2, "tilted up"
 
 
-def test_the_world_is_left_as_it_was(tmp_path: Path) -> None:
+def test_the_world_is_left_as_it_was(tmp_path):
     world = World(mute=True)
     with pytest.raises(RfedgeError, match=r"no image of frame 9 within 0\.2 s"):
         CarlaRecorder(carla, world, SMALL).record(tmp_path)
@@ -159,12 +158,12 @@ def test_the_world_is_left_as_it_was(tmp_path: Path) -> None:
     assert not world.settings.synchronous_mode
 
 
-def test_a_lane_that_ends_is_said(tmp_path: Path) -> None:
+def test_a_lane_that_ends_is_said(tmp_path):
     with pytest.raises(InvalidInput, match="ends after 2"):
         CarlaRecorder(carla, World(lane_end=16.0), SMALL).record(tmp_path)
 
 
-def test_the_rig_has_18_cameras_in_three_rows() -> None:
+def test_the_rig_has_18_cameras_in_three_rows():
     assert len({mount.name for mount in RIG}) == len(RIG) == 18
     assert {mount.z_m for mount in RIG} == {0.5, 2.5, 5.5}
     assert [mount.name for mount in mounts_named("mid_front,high_back")] == [
@@ -175,7 +174,7 @@ def test_the_rig_has_18_cameras_in_three_rows() -> None:
         mounts_named("top")
 
 
-def test_the_labels_and_calls_exist_in_the_client_library() -> None:
+def test_the_labels_and_calls_exist_in_the_client_library():
     """What the stand-in answers is what the library offers."""
     for name in ("Car", "Truck", "Bus", "Motorcycle", "Bicycle"):
         assert hasattr(carla.CityObjectLabel, name)

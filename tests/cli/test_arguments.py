@@ -22,7 +22,7 @@ def made(path: str) -> Path:
 
 
 @pytest.mark.parametrize("name", ["mine", "mine.rff"])
-def test_an_imported_field_comes_before_a_samples_of_the_same_name(name: str) -> None:
+def test_an_imported_field_comes_before_a_samples_of_the_same_name(name):
     sample = made("samples/fields/mine.rff")
     assert field_path(name) == sample
     imported = made("out/fields/mine.rff")
@@ -30,26 +30,26 @@ def test_an_imported_field_comes_before_a_samples_of_the_same_name(name: str) ->
     assert field_path(Path(name)) == imported
 
 
-def test_a_file_of_that_path_comes_before_every_name() -> None:
+def test_a_file_of_that_path_comes_before_every_name():
     made("out/fields/mine.rff")
     assert field_path("mine.rff") == Path("out/fields/mine.rff")
     assert field_path(made("mine.rff")) == Path("mine.rff")
 
 
-def test_a_folder_is_no_field() -> None:
+def test_a_folder_is_no_field():
     """A dataset and the field trained on it often have one name."""
     Path("street").mkdir()
     imported = made("out/fields/street.rff")
     assert field_path("street") == imported
 
 
-def test_a_path_with_folders_is_only_a_path() -> None:
+def test_a_path_with_folders_is_only_a_path():
     made("out/fields/mine.rff")
     with pytest.raises(InvalidInput, match=r"there is no file fields/mine;"):
         field_path("fields/mine")
 
 
-def test_what_is_not_found_lists_what_was_tried_and_what_there_is() -> None:
+def test_what_is_not_found_lists_what_was_tried_and_what_there_is():
     with pytest.raises(InvalidInput, match=r"names known here: none \(rfedge field import"):
         field_path("mine")
     made("out/fields/other.rff")

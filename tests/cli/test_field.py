@@ -82,9 +82,7 @@ def drive_of(here: Path, field: SplatField) -> Path:
     return file
 
 
-def test_an_imported_ply_is_found_by_its_name_and_exported_exactly(
-    here: Path, splats: Gaussians, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_imported_ply_is_found_by_its_name_and_exported_exactly(here, splats, capsys):
     write_ply(here / "my.ply", splats)
     FieldImport(here / "my.ply", "street", raw=True, antialiased=True).run()
     said = capsys.readouterr().out
@@ -100,9 +98,7 @@ def test_an_imported_ply_is_found_by_its_name_and_exported_exactly(
     np.testing.assert_array_equal(read_splat_file(here / "tenth.ply")[0].sh, back.sh[:20])
 
 
-def test_a_field_of_nerfstudio_comes_back_to_its_world(
-    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_field_of_nerfstudio_comes_back_to_its_world(here, splats, drive, capsys):
     write_ply(here / "ns.ply", moved(splats, NERFSTUDIO))
     rotation, shift = NERFSTUDIO.rotation, np.array(NERFSTUDIO.pose.translation_m)
     transform = np.column_stack([rotation, shift / NERFSTUDIO.scale]).tolist()
@@ -120,7 +116,7 @@ def test_a_field_of_nerfstudio_comes_back_to_its_world(
     assert read_rgb(here / "pairs.png").shape == (4 * SIZE[1], 2 * SIZE[0], 3)
 
 
-def test_a_tile_origin_is_taken_off_and_kept(here: Path, splats: Gaussians) -> None:
+def test_a_tile_origin_is_taken_off_and_kept(here, splats):
     write_ply(here / "a.ply", splats)
     FieldImport(here / "a.ply", "a", tile_origin=(1.0, 2.0, 3.0), raw=True).run()
     field = load_field(here / "out/fields/a.rff")
@@ -129,9 +125,7 @@ def test_a_tile_origin_is_taken_off_and_kept(here: Path, splats: Gaussians) -> N
     np.testing.assert_allclose(field.bounds.low_m, low_m, atol=1e-6)
 
 
-def test_info_says_what_is_known_and_what_a_frame_takes(
-    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_says_what_is_known_and_what_a_frame_takes(here, splats, drive, capsys):
     save_field(SplatField(splats), here / "a.rff")
     FieldInfo(here / "a.rff", size=(64, 48)).run()
     said = capsys.readouterr().out
@@ -143,9 +137,7 @@ def test_info_says_what_is_known_and_what_a_frame_takes(
     assert "dB" in capsys.readouterr().out
 
 
-def test_a_field_is_slimmed_with_and_without_cameras(
-    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_field_is_slimmed_with_and_without_cameras(here, splats, drive, capsys):
     save_field(SplatField(splats), here / "a.rff")
     FieldSlim(here / "a.rff", here / "b.rff", 50).run()
     FieldSlim(here / "a.rff", here / "c.rff", 50, drive=drive, iterations=5, raw=True).run()
@@ -153,9 +145,7 @@ def test_a_field_is_slimmed_with_and_without_cameras(
     assert load_field(here / "b.rff").primitives == load_field(here / "c.rff").primitives == 50
 
 
-def test_a_field_is_slimmed_to_a_size_and_to_a_number_of_passes(
-    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_field_is_slimmed_to_a_size_and_to_a_number_of_passes(here, splats, drive, capsys):
     save_field(SplatField(splats), here / "a.rff")
     FieldSlim(here / "a.rff", here / "b.rff", max_mb=0.012, drive=drive, iterations=3).run()
     assert (here / "b.rff").stat().st_size <= 12_000
@@ -172,15 +162,13 @@ def test_a_field_is_slimmed_to_a_size_and_to_a_number_of_passes(
         ({"passes": 2}, "go with --drive"),
     ],
 )
-def test_a_size_has_one_goal_and_cameras(
-    here: Path, splats: Gaussians, given: dict[str, int], problem: str
-) -> None:
+def test_a_size_has_one_goal_and_cameras(here, splats, given, problem):
     save_field(SplatField(splats), here / "a.rff")
     with pytest.raises(InvalidInput, match=problem):
         FieldSlim(here / "a.rff", here / "b.rff", **given).run()
 
 
-def test_levels_are_fitted_to_a_drives_cameras(here: Path, splats: Gaussians, drive: Path) -> None:
+def test_levels_are_fitted_to_a_drives_cameras(here, splats, drive):
     save_field(SplatField(splats), here / "a.rff")
     FieldSlim(here / "a.rff", here / "b.rff", drive=drive, iterations=5).run()
     field = load_field(here / "b.rff")
@@ -188,9 +176,7 @@ def test_levels_are_fitted_to_a_drives_cameras(here: Path, splats: Gaussians, dr
     assert set(field.levels) == {0.5, 0.25, 0.1}
 
 
-def test_a_field_is_looked_at_around_and_along_a_drive(
-    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_field_is_looked_at_around_and_along_a_drive(here, splats, drive, capsys):
     save_field(SplatField(splats), here / "a.rff")
     Render(here / "a.rff", here / "orbit", frames=3, size=(32, 24), up="-y").run()
     assert sorted(p.name for p in (here / "orbit").iterdir()) == [
@@ -223,9 +209,7 @@ def test_a_field_is_looked_at_around_and_along_a_drive(
         (Render(Path("a.rff"), Path("o"), frames=0), InvalidInput, "frames"),
     ],
 )
-def test_a_mistake_is_named_and_leaves_nothing_behind(
-    here: Path, splats: Gaussians, verb, error: type[Exception], named: str
-) -> None:
+def test_a_mistake_is_named_and_leaves_nothing_behind(here, splats, verb, error, named):
     save_field(SplatField(splats), here / "a.rff")
     write_ply(here / "empty.ply", Gaussians(*(a[:0] for a in vars(splats).values())))
     with pytest.raises(error, match=named):
@@ -246,9 +230,7 @@ def faint_drive(here: Path, splats: Gaussians) -> tuple[Path, Gaussians]:
     return drive_of(here, field), tiny
 
 
-def test_how_splats_are_drawn_survives_export_and_import(
-    here: Path, splats: Gaussians, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_how_splats_are_drawn_survives_export_and_import(here, splats, capsys):
     drive, tiny = faint_drive(here, splats)
     save_field(SplatField(tiny, FieldMetadata(antialiased=True)), here / "a.rff")
     FieldExport(Path("a.rff"), here / "a.ply").run()
@@ -259,9 +241,7 @@ def test_how_splats_are_drawn_survives_export_and_import(
     assert load_field(field_path("back")).metadata.antialiased
 
 
-def test_a_field_in_the_wrong_mode_is_found_out_and_put_right(
-    here: Path, splats: Gaussians, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_field_in_the_wrong_mode_is_found_out_and_put_right(here, splats, capsys):
     drive, tiny = faint_drive(here, splats)
     write_ply(here / "a.ply", tiny)
     FieldImport(here / "a.ply", "a", raw=True).run()
@@ -269,14 +249,11 @@ def test_a_field_in_the_wrong_mode_is_found_out_and_put_right(
     assert "it was trained to be drawn antialiased" in said
     assert "fits as it is" in said
     gained = re.search(r"fits as it is: (\S+) dB instead of (\S+) dB", said)
-    assert gained is not None
     assert float(gained[1]) > float(gained[2]) + 3
     assert "the field's mode fits" in said_by_check("fixed.rff", drive, capsys)
 
 
-def test_an_import_does_not_overwrite_a_field_without_being_told(
-    here: Path, splats: Gaussians
-) -> None:
+def test_an_import_does_not_overwrite_a_field_without_being_told(here, splats):
     write_ply(here / "a.ply", splats)
     FieldImport(here / "a.ply", "mine").run()
     before = (here / "out/fields/mine.rff").read_bytes()
@@ -292,9 +269,7 @@ def splats_without_half(splats: Gaussians) -> Gaussians:
     return Gaussians(*(np.ascontiguousarray(array[:100]) for array in vars(splats).values()))
 
 
-def test_a_name_means_the_same_field_to_encode_and_decode(
-    here: Path, splats: Gaussians, drive: Path
-) -> None:
+def test_a_name_means_the_same_field_to_encode_and_decode(here, splats, drive):
     write_ply(here / "a.ply", splats)
     FieldImport(here / "a.ply", "mine").run()
     Encode(drive, Path("mine"), here / "by-name.rfv").run()

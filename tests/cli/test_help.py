@@ -64,11 +64,10 @@ def in_one_line(text: str) -> str:
 
 def verbs_in(text: str) -> list[str]:
     listed = re.search(r"\{([a-z,-]+)\}", text)
-    assert listed is not None
     return listed[1].split(",")
 
 
-def test_every_verb_has_help_that_says_once_what_it_does() -> None:
+def test_every_verb_has_help_that_says_once_what_it_does():
     verbs = verbs_in(help_of(""))
     assert set(GROUPS) < set(verbs)
     verbs += [f"{group} {verb}" for group in GROUPS for verb in verbs_in(help_of(group))]
@@ -94,23 +93,23 @@ def test_every_verb_has_help_that_says_once_what_it_does() -> None:
         ("eval compare", "FIELD"),
     ],
 )
-def test_placeholders_say_what_they_want(verb: str, shown: str) -> None:
+def test_placeholders_say_what_they_want(verb, shown):
     assert f" {shown} " in in_one_line(help_of(verb))
 
 
-def test_the_help_of_an_option_is_one_paragraph(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_help_of_an_option_is_one_paragraph(monkeypatch):
     """Where its docstring goes on in a second line, the terminal's width decides alone."""
     monkeypatch.setenv("COLUMNS", "500")
     done = rfedge("train", "--help")
     assert "KITTI, ...). Of a folder that `rfedge dataset split` made" in done.stdout
 
 
-def test_the_version_is_that_of_the_distribution() -> None:
+def test_the_version_is_that_of_the_distribution():
     done = in_a_process("--version")
     assert (done.returncode, done.stdout) == (0, f"rfedge {version('rfedge')}\n")
 
 
-def test_the_help_loads_nothing_heavy() -> None:
+def test_the_help_loads_nothing_heavy():
     """Imports make ``--help`` slow (torch alone takes seconds), so they are looked for."""
     code = (
         f"import sys; import rfedge.cli; print([name for name in {HEAVY!r} if name in sys.modules])"
@@ -153,9 +152,7 @@ def test_the_help_loads_nothing_heavy() -> None:
         ),
     ],
 )
-def test_a_users_mistake_is_one_line_and_exit_status_2(
-    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_users_mistake_is_one_line_and_exit_status_2(arguments, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = rfedge(*arguments)
     assert done.returncode == 2
@@ -164,13 +161,13 @@ def test_a_users_mistake_is_one_line_and_exit_status_2(
     assert list(tmp_path.iterdir()) == [], "a refused command leaves nothing behind"
 
 
-def test_a_process_ends_with_that_line_and_status() -> None:
+def test_a_process_ends_with_that_line_and_status():
     done = in_a_process("train", "nowhere", "--out", "field.txt")
     assert done == rfedge("train", "nowhere", "--out", "field.txt")
     assert done.returncode == 2
 
 
-def test_a_reader_that_has_enough_ends_the_command_quietly() -> None:
+def test_a_reader_that_has_enough_ends_the_command_quietly():
     command = [sys.executable, "-m", "rfedge", "eval", "--help"]
     reader, writer = os.pipe()
     os.close(reader)
@@ -179,7 +176,7 @@ def test_a_reader_that_has_enough_ends_the_command_quietly() -> None:
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-def test_a_log_file_gets_each_line_as_it_comes(tmp_path: Path) -> None:
+def test_a_log_file_gets_each_line_as_it_comes(tmp_path):
     """The first line of a long training arrives in a pipe while it goes on."""
     code = "import sys; from rfedge.cli import main; sys.exit(main())"
     street = Path(__file__).parents[2] / "samples/street/transforms_train.json"
@@ -190,7 +187,6 @@ def test_a_log_file_gets_each_line_as_it_comes(tmp_path: Path) -> None:
         text=True,
     )
     try:
-        assert training.stdout is not None
         assert training.stdout.readline().startswith("Training 500 Gaussians")
         assert training.poll() is None
     finally:

@@ -19,8 +19,6 @@ from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour
 from rfcore.views import FieldView
 
-__all__ = ["SentFrame", "SentStream", "exchange", "make_adapting_stream", "make_stream"]
-
 SIZE_PX = (64, 48)
 WALL_M = 10.0
 SHIFT_PX = 3.0

@@ -1,20 +1,15 @@
 """The two savings figures: as published, and at equal quality."""
 
 import math
-from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
 
+from codec.pictures import noise, pair
 from rfcore.errors import InvalidInput
-from rfcore.image import I420
 from rfcore.metrics import psnr
-from rfcore.views import FieldView
 from rfedge.demo.measure import RatePoint, intra_curve, saving_at_equal_psnr
 from rfedge.evaluate.savings import PaperSavings, paper_savings, paper_savings_percent
-
-PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, FieldView]]
 
 
 def curve_of(*points: tuple[float, float]) -> list[RatePoint]:
@@ -24,14 +19,12 @@ def curve_of(*points: tuple[float, float]) -> list[RatePoint]:
 CURVE = curve_of((8000, 44), (4000, 41), (2000, 38), (1000, 35))
 
 
-def test_equal_sizes_read_fifty_percent() -> None:
+def test_equal_sizes_read_fifty_percent():
     assert PaperSavings(i_bytes=700, p_bytes=700, second_type="P").percent == 50.0
 
 
 @pytest.mark.parametrize("preset", ["veryfast", "medium", "veryslow"])
-def test_a_good_render_saves_more_than_an_unrelated_one(
-    preset: str, pair: PairMaker, noise: PictureMaker
-) -> None:
+def test_a_good_render_saves_more_than_an_unrelated_one(preset):
     frame, view = pair(301, 169)
     good = paper_savings(frame, view.render, preset, 23)
     bad = paper_savings(frame, noise(301, 169, 3), preset, 23)
@@ -41,12 +34,12 @@ def test_a_good_render_saves_more_than_an_unrelated_one(
     assert paper_savings_percent(frame, view.render, preset, 23) == good.percent > 50
 
 
-def test_the_published_figure_needs_pictures_of_one_size(pair: PairMaker) -> None:
+def test_the_published_figure_needs_pictures_of_one_size():
     with pytest.raises(InvalidInput, match=r"camera: \(32, 32\) px where the render has"):
         paper_savings(pair(32, 32)[0], pair(64, 32)[1].render, "medium", 23)
 
 
-def test_intra_curves_rise_in_bytes_and_quality(pair: PairMaker) -> None:
+def test_intra_curves_rise_in_bytes_and_quality():
     frames = [pair(161, 95, 4.0 * i)[0] for i in range(2)]
     curve = intra_curve(frames, "veryfast", [33, 18, 23, 28], lambda a, b: psnr(a.y, b.y))
     assert [point.crf for point in curve] == [18, 23, 28, 33]
@@ -58,7 +51,7 @@ def test_intra_curves_rise_in_bytes_and_quality(pair: PairMaker) -> None:
     assert saving == pytest.approx(75.0)
 
 
-def test_between_points_bytes_are_interpolated_in_the_logarithm() -> None:
+def test_between_points_bytes_are_interpolated_in_the_logarithm():
     intra_bytes = math.sqrt(4000 * 2000)
     assert saving_at_equal_psnr(CURVE, intra_bytes / 2, 39.5) == pytest.approx(50.0)
     assert saving_at_equal_psnr(CURVE, 4 * intra_bytes, 39.5) == pytest.approx(-300.0)
@@ -75,8 +68,6 @@ def test_between_points_bytes_are_interpolated_in_the_logarithm() -> None:
         (curve_of((9, math.inf), (8, 41), (7, 38), (6, 35)), 39.0, "must be finite"),
     ],
 )
-def test_a_saving_that_the_curve_cannot_tell_is_refused(
-    curve: list[RatePoint], psnr_db: float, problem: str
-) -> None:
+def test_a_saving_that_the_curve_cannot_tell_is_refused(curve, psnr_db, problem):
     with pytest.raises(InvalidInput, match=problem):
         saving_at_equal_psnr(curve, 100, psnr_db)

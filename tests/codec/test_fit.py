@@ -7,17 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from codec.pictures import noise, view_of
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.picture_coder import CodedPicture
 from rfcore.codec.sender.rate import MAX_TRIES, code_to_fit
 from rfcore.errors import InvalidInput
-from rfcore.image import I420
-from rfcore.views import FieldView
 
-PictureMaker = Callable[..., I420]
-ViewMaker = Callable[[I420], FieldView]
 SIZE_PX = (160, 96)
 
 
@@ -34,8 +31,8 @@ def halving(first_bytes: int, crf_to_halve: float) -> Callable[[float], CodedPic
     crf=st.floats(1, 51),
 )
 def test_whatever_the_rate_it_fits_if_the_highest_crf_does(
-    first_bytes: int, crf_to_halve: float, limit_bytes: int, crf: float
-) -> None:
+    first_bytes, crf_to_halve, limit_bytes, crf
+):
     code = halving(first_bytes, crf_to_halve)
     made = code_to_fit(code, crf, limit_bytes)
     assert made.tries <= MAX_TRIES
@@ -47,9 +44,7 @@ def test_whatever_the_rate_it_fits_if_the_highest_crf_does(
 
 
 @given(first_bytes=st.integers(20_000, 200_000), crf_to_halve=st.floats(6, 20))
-def test_a_steady_rate_takes_three_codings_and_wastes_a_tenth(
-    first_bytes: int, crf_to_halve: float
-) -> None:
+def test_a_steady_rate_takes_three_codings_and_wastes_a_tenth(first_bytes, crf_to_halve):
     """The second step knows the slope; it aims at 0.95, and the least step, 1 CRF, may
     take 11 % more where 6 halve."""
     limit_bytes = first_bytes // 2
@@ -60,9 +55,7 @@ def test_a_steady_rate_takes_three_codings_and_wastes_a_tenth(
 
 
 @pytest.mark.parametrize("share", [0.9, 0.5, 0.3])
-def test_noise_is_coded_again_until_it_fits_and_decodes(
-    noise: PictureMaker, view_of: ViewMaker, share: float
-) -> None:
+def test_noise_is_coded_again_until_it_fits_and_decodes(share):
     frame, render = noise(*SIZE_PX, 1), view_of(noise(*SIZE_PX, 2))
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX))
     free = encoder.encode(encoder.start(0), frame, render)
@@ -78,7 +71,7 @@ def test_noise_is_coded_again_until_it_fits_and_decodes(
     assert shown.frame.digest() == made.reconstruction.digest()
 
 
-def test_what_no_crf_makes_fit_comes_back_too_long(noise: PictureMaker, view_of: ViewMaker) -> None:
+def test_what_no_crf_makes_fit_comes_back_too_long():
     frame, view = noise(*SIZE_PX, 1), view_of(noise(*SIZE_PX, 2))
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast"))
     choice = FrameChoice(limit_bytes=1)
@@ -99,6 +92,6 @@ def test_what_no_crf_makes_fit_comes_back_too_long(noise: PictureMaker, view_of:
     assert made.packet.payload == at_the_highest.packet.payload
 
 
-def test_a_limit_below_one_byte_is_refused() -> None:
+def test_a_limit_below_one_byte_is_refused():
     with pytest.raises(InvalidInput, match="limit_bytes: 0"):
         FrameChoice(limit_bytes=0)

@@ -1,10 +1,9 @@
 """D + lambda R of blocks: its formula in plain Python, and that nothing is computed twice."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
+from codec.pictures import flat, noise, pair
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import Reference
 from rfcore.codec.sender import rate
@@ -12,10 +11,7 @@ from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.rate import FrameCosts, RateDistortion, RateModel, RateTarget
 from rfcore.image import I420
 from rfcore.native.warp import BlockCosts
-from rfcore.views import FieldView
 
-PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (96, 64)
 
 
@@ -42,7 +38,7 @@ def cost_of_block(satd: int, ssd: int, crf: float) -> float:
 
 
 @pytest.mark.parametrize("crf", [1.0, 23.0, 35.5, 51.0])
-def test_each_block_costs_what_the_formula_says(pair: PairMaker, crf: float) -> None:
+def test_each_block_costs_what_the_formula_says(crf):
     frame, view = pair(*SIZE_PX)
     blocks = FrameCosts(frame).against(view.render)
     got = RateDistortion.at(crf).coded_or_copied(blocks)
@@ -51,12 +47,12 @@ def test_each_block_costs_what_the_formula_says(pair: PairMaker, crf: float) -> 
         assert got[row, column] == pytest.approx(cost_of_block(satd, ssd, crf))
 
 
-def test_a_frame_against_itself_costs_nothing(noise: PictureMaker) -> None:
+def test_a_frame_against_itself_costs_nothing():
     frame = noise(*SIZE_PX, 1)
     assert RateDistortion.at(23).coded_or_copied(FrameCosts(frame).against(frame)).max() == 0
 
 
-def test_a_dearer_bit_and_a_coarser_step_never_make_a_frame_cheaper(pair: PairMaker) -> None:
+def test_a_dearer_bit_and_a_coarser_step_never_make_a_frame_cheaper():
     frame, view = pair(*SIZE_PX)
     blocks = FrameCosts(frame).against(view.render)
     totals = [float(RateDistortion.at(crf).coded_or_copied(blocks).sum()) for crf in range(1, 52)]
@@ -64,7 +60,7 @@ def test_a_dearer_bit_and_a_coarser_step_never_make_a_frame_cheaper(pair: PairMa
     assert totals[-1] <= blocks.ssd.sum(), "what is copied costs its error"
 
 
-def test_blocks_of_one_level_cost_nothing_without_a_reference(flat: PictureMaker) -> None:
+def test_blocks_of_one_level_cost_nothing_without_a_reference():
     levels = np.random.default_rng(1).integers(1, 255, (8, 12), dtype=np.uint8)
     luma = levels.repeat(8, 0).repeat(8, 1)
     frame = I420(luma, *flat(*SIZE_PX, 128).planes[1:])
@@ -72,19 +68,7 @@ def test_blocks_of_one_level_cost_nothing_without_a_reference(flat: PictureMaker
     assert FrameCosts(frame).intra.satd.max() == 0
 
 
-def test_the_same_picture_is_computed_once_and_another_one_anew(
-    pair: PairMaker, noise: PictureMaker, calls: list[tuple[int, int]]
-) -> None:
-    frame, view = pair(*SIZE_PX)
-    costs = FrameCosts(frame)
-    assert costs.against(view.render) is costs.against(view.render)
-    assert len(calls) == 1
-    other = costs.against(noise(*SIZE_PX, 1))
-    assert len(calls) == 2
-    assert not np.array_equal(other.ssd, costs.against(view.render).ssd)
-
-
-def test_many_short_lived_pictures_are_never_mistaken_for_one_another(pair: PairMaker) -> None:
+def test_many_short_lived_pictures_are_never_mistaken_for_one_another():
     """Memory that was freed may be used again, and so may the identity of a picture."""
     frame = pair(*SIZE_PX)[0]
     costs = FrameCosts(frame)
@@ -94,9 +78,7 @@ def test_many_short_lived_pictures_are_never_mistaken_for_one_another(pair: Pair
         assert costs.against(picture).ssd.sum() == expected.sum()
 
 
-def test_coding_a_frame_under_rate_control_computes_no_picture_twice(
-    pair: PairMaker, calls: list[tuple[int, int]]
-) -> None:
+def test_coding_a_frame_under_rate_control_computes_no_picture_twice(calls):
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast"))
     state, model = encoder.start(1), RateModel()
     for index in range(3):

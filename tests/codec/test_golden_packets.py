@@ -18,7 +18,7 @@ from rfcore.wire.messages import Frame, Hello
 GOLDEN = Path(__file__).parents[1] / "data" / "delta_packets.npz"
 
 
-def test_golden_packets_decode_to_their_digests() -> None:
+def test_golden_packets_decode_to_their_digests():
     with np.load(GOLDEN, allow_pickle=False) as stored:
         arrays = dict(stored)
     hello = client_message_from_bytes(arrays["hello"].tobytes())

@@ -1,11 +1,11 @@
 """One header serves every effort and CRF of a size, and receivers take no other."""
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
+from codec.pictures import pair
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import StreamHeader, check_header, stream_header
 from rfcore.codec.h264.config import EFFORTS, PRESETS, CodecConfig, Coder, CoderSettings
@@ -14,9 +14,7 @@ from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.codec.sender.picture_coder import SliceCoding, encode_slice
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
-from rfcore.views import FieldView
 
-PairMaker = Callable[..., tuple[I420, FieldView]]
 OWN, X264 = CodecConfig(300, 168), CodecConfig(300, 168, "x264-medium")
 
 
@@ -25,7 +23,7 @@ def header(request: pytest.FixtureRequest) -> StreamHeader:
     return DeltaEncoder(request.param).header
 
 
-def test_every_effort_and_crf_has_the_same_parameter_sets() -> None:
+def test_every_effort_and_crf_has_the_same_parameter_sets():
     """Golden: receivers in the field accept these bytes and no others."""
     for effort in ("fast", "default", "thorough"):
         for crf in (1.0, 23.0, 51.0):
@@ -34,7 +32,7 @@ def test_every_effort_and_crf_has_the_same_parameter_sets() -> None:
             assert made.pps.hex() == "68eb8f2c"
 
 
-def test_the_parameter_sets_of_all_sizes_keep_their_bytes() -> None:
+def test_the_parameter_sets_of_all_sizes_keep_their_bytes():
     sizes = [(2, 2), (3, 2), (17, 33), (640, 360), (1280, 720), (1920, 1080), (4096, 2304)]
     headers = [stream_header(CodecConfig(*size_px)) for size_px in sizes]
     digest = hashlib.sha256(b"".join(header.sps + header.pps for header in headers))
@@ -45,16 +43,14 @@ SIZES = [(2, 2), (17, 33), (300, 168), (640, 360), (1280, 720), (1920, 1080), (4
 
 
 @pytest.mark.parametrize("size_px", SIZES)
-def test_x264_writes_the_sets_that_are_expected_of_it(size_px: tuple[int, int]) -> None:
+def test_x264_writes_the_sets_that_are_expected_of_it(size_px):
     """Or ``encode_slice`` raises."""
     grey = I420.filled(size_px)
     assert encode_slice(CodecConfig(*size_px, "x264-ultrafast"), [grey], grey)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_no_preset_crf_number_of_references_or_threads_changes_the_sets_of_x264(
-    preset: str, pair: PairMaker
-) -> None:
+def test_no_preset_crf_number_of_references_or_threads_changes_the_sets_of_x264(preset):
     frame, view = pair(300, 168)
     for crf, references in zip((1, 17.5, 23, 51), range(4), strict=True):
         config = CodecConfig(300, 168, f"x264-{preset}", crf)
@@ -68,15 +64,13 @@ def test_no_preset_crf_number_of_references_or_threads_changes_the_sets_of_x264(
     assert len(shared) == pytest.approx(len(alone), rel=0.02)
 
 
-def test_other_sets_than_those_that_are_expected_of_x264_are_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_other_sets_than_those_that_are_expected_of_x264_are_refused(monkeypatch):
     monkeypatch.setattr("rfcore.codec.sender.picture_coder.X264_REFERENCE_FRAMES", 4)
     with pytest.raises(CodecError, match="other parameter sets than it was configured for"):
         DeltaEncoder(X264)
 
 
-def test_a_better_preset_or_crf_changes_the_slice(pair: PairMaker) -> None:
+def test_a_better_preset_or_crf_changes_the_slice():
     """The zone's analysis settings reach the P picture, and CRF its quantiser."""
     frame, view = pair(300, 168)
 
@@ -89,7 +83,7 @@ def test_a_better_preset_or_crf_changes_the_slice(pair: PairMaker) -> None:
     assert len({coded(preset, 23) for preset in PRESETS}) >= len(PRESETS) - 1
 
 
-def test_x264_takes_no_fourth_reference(pair: PairMaker) -> None:
+def test_x264_takes_no_fourth_reference():
     frame, view = pair(300, 168)
     with pytest.raises(InvalidInput, match="4 are more than the 3 of x264"):
         encode_slice(X264, [view.render] * 4, frame)
@@ -109,9 +103,7 @@ def test_x264_takes_no_fourth_reference(pair: PairMaker) -> None:
         (8192, 2, 51),
     ],
 )
-def test_levels_are_the_lowest_that_annex_a_allows(
-    width_px: int, height_px: int, level_idc: int
-) -> None:
+def test_levels_are_the_lowest_that_annex_a_allows(width_px, height_px, level_idc):
     assert CodecConfig(width_px, height_px).level_idc == level_idc
 
 
@@ -125,22 +117,20 @@ def test_levels_are_the_lowest_that_annex_a_allows(
         ({"pps": pcm_pps()}, "pps"),
     ],
 )
-def test_a_header_that_our_encoder_would_not_make_is_refused(
-    header: StreamHeader, change: dict[str, object], name: str
-) -> None:
+def test_a_header_that_our_encoder_would_not_make_is_refused(header, change, name):
     if "width_px" in change:
-        change = {"config": replace(header.config, **change)}  # type: ignore[arg-type]
+        change = {"config": replace(header.config, **change)}
     with pytest.raises(InvalidInput, match=rf"stream_header\.{name}: .* where our encoder"):
-        DeltaDecoder(replace(header, **change))  # type: ignore[arg-type]
+        DeltaDecoder(replace(header, **change))
 
 
-def test_the_header_of_one_coder_is_refused_as_that_of_the_other() -> None:
+def test_the_header_of_one_coder_is_refused_as_that_of_the_other():
     for config, theirs in ((OWN, X264), (X264, OWN)):
         with pytest.raises(InvalidInput, match=r"stream_header\.sps"):
             DeltaDecoder(replace(stream_header(theirs), config=config))
 
 
-def test_every_flipped_bit_of_a_header_is_refused(header: StreamHeader) -> None:
+def test_every_flipped_bit_of_a_header_is_refused(header):
     for name in ("sps", "pps"):
         nal = getattr(header, name)
         for bit in range(8 * len(nal)):
@@ -162,16 +152,14 @@ def test_every_flipped_bit_of_a_header_is_refused(header: StreamHeader) -> None:
         ({"crf": 52}, "codec.crf: 52"),
     ],
 )
-def test_configurations_outside_the_lists_are_refused(
-    change: dict[str, object], named: str
-) -> None:
+def test_configurations_outside_the_lists_are_refused(change, named):
     good: dict[str, object] = {"width_px": 640, "height_px": 360}
     with pytest.raises(InvalidInput, match=named):
-        CodecConfig(**{**good, **change})  # type: ignore[arg-type]
+        CodecConfig(**{**good, **change})
 
 
 @pytest.mark.parametrize("effort", EFFORTS)
-def test_an_effort_survives_the_command_line(effort: str) -> None:
+def test_an_effort_survives_the_command_line(effort):
     settings = CoderSettings.of(effort)
     assert settings.name == effort
     assert ("--effort" in settings.arguments) == (settings.coder is Coder.OWN)
@@ -186,8 +174,6 @@ def test_an_effort_survives_the_command_line(effort: str) -> None:
         ({"coder": Coder.X264, "preset": "placebo"}, "preset: 'placebo' is none of ultrafast"),
     ],
 )
-def test_coder_settings_that_contradict_each_other_are_refused(
-    given: dict[str, object], problem: str
-) -> None:
+def test_coder_settings_that_contradict_each_other_are_refused(given, problem):
     with pytest.raises(InvalidInput, match=problem):
-        CoderSettings(**given)  # type: ignore[arg-type]
+        CoderSettings(**given)

@@ -38,14 +38,14 @@ def track(effort: str, ms: float | None, rate: float | None, **knobs: Any) -> di
     return {"settings": kept, "tracking": effort, "track_ms": ms, "rate_percent": rate}
 
 
-def test_a_rung_is_named_by_what_distinguishes_it() -> None:
+def test_a_rung_is_named_by_what_distinguishes_it():
     assert Rung().name == "100% 3ref default"
     low = Rung(Quality(0.25, 0, 16, 0.5), 0, photometric=False, effort="fast")
     assert low.name == "25% sh0 16samples half-size render-only no-light fast"
     assert Rung(tracking=TrackingEffort.HALF).name == "100% 3ref default track-half"
 
 
-def test_a_ladder_has_rungs_of_one_coder(tmp_path: Path) -> None:
+def test_a_ladder_has_rungs_of_one_coder(tmp_path):
     path = write(tmp_path / "ladder.json", row(40, 0), row(80, 0, effort="x264-medium"))
     assert [r.rung.effort for r in read_ladder(path, "splats", 28)] == ["default"]
     (kept,) = read_ladder(path, "splats", 28, Coder.X264)
@@ -55,7 +55,7 @@ def test_a_ladder_has_rungs_of_one_coder(tmp_path: Path) -> None:
         read_ladder(other, "splats", 28)
 
 
-def test_the_front_is_faster_step_by_step_and_never_worse_than_what_it_leaves_out() -> None:
+def test_the_front_is_faster_step_by_step_and_never_worse_than_what_it_leaves_out():
     rungs = [
         MeasuredRung(Rung(), ms, 1.0, rate)
         for ms, rate in [(80, 0), (90, 0), (60, 5), (70, 5), (60, 9), (20, 40), (30, 39), (25, 41)]
@@ -69,7 +69,7 @@ def test_the_front_is_faster_step_by_step_and_never_worse_than_what_it_leaves_ou
         )
 
 
-def test_a_ladder_is_read_for_its_kind_and_the_nearest_crf(tmp_path: Path) -> None:
+def test_a_ladder_is_read_for_its_kind_and_the_nearest_crf(tmp_path):
     path = write(
         tmp_path / "ladder.json",
         row(80, 0),
@@ -83,7 +83,7 @@ def test_a_ladder_is_read_for_its_kind_and_the_nearest_crf(tmp_path: Path) -> No
     assert [r.sender_ms for r in read_ladder(path, "splats", 50.0)] == [70]
 
 
-def test_a_sender_that_localises_plans_with_the_time_and_rate_of_tracking(tmp_path: Path) -> None:
+def test_a_sender_that_localises_plans_with_the_time_and_rate_of_tracking(tmp_path):
     """Each rung with each effort at its quality; the efforts that lost the drive are left out."""
     tracks = (
         track("full", 20, 1.0),
@@ -109,9 +109,7 @@ def test_a_sender_that_localises_plans_with_the_time_and_rate_of_tracking(tmp_pa
     assert rates == pytest.approx([1.0, 2.0, 10.0, 22.4, 32.0, 125.0])
 
 
-def test_a_ladder_without_times_of_tracking_is_none_for_a_sender_that_localises(
-    tmp_path: Path,
-) -> None:
+def test_a_ladder_without_times_of_tracking_is_none_for_a_sender_that_localises(tmp_path):
     path = write(tmp_path / "ladder.json", row(40, 0))
     assert read_ladder(path, "splats", 28)
     with pytest.raises(InvalidData, match=r"ladder\.json.*no times of tracking.*eval ladder"):
@@ -132,9 +130,7 @@ def test_a_ladder_without_times_of_tracking_is_none_for_a_sender_that_localises(
         (json.dumps({"kind": "ladder", "rows": [row(9, 0, detail=0.3)]}), "quality.detail"),
     ],
 )
-def test_a_file_that_is_no_ladder_is_refused_by_name(
-    tmp_path: Path, content: str, named: str
-) -> None:
+def test_a_file_that_is_no_ladder_is_refused_by_name(tmp_path, content, named):
     path = tmp_path / "ladder.json"
     path.write_text(content)
     with pytest.raises(InvalidData, match=rf"ladder\.json.*{named}.*rfedge eval ladder"):
@@ -144,6 +140,6 @@ def test_a_file_that_is_no_ladder_is_refused_by_name(
 
 
 @pytest.mark.parametrize("knob", [{"references": 5}, {"references": -1}, {"effort": "placebo"}])
-def test_a_rung_that_is_none_is_refused(knob: dict[str, Any]) -> None:
+def test_a_rung_that_is_none_is_refused(knob):
     with pytest.raises(InvalidInput, match=f"rung.{next(iter(knob))}"):
         Rung(**knob)

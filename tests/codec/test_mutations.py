@@ -179,9 +179,7 @@ def damage(
 
 
 @pytest.mark.parametrize("name", ["stream", "adapting"])
-def test_damaged_packets_never_show_a_wrong_picture(
-    name: str, request: pytest.FixtureRequest
-) -> None:
+def test_damaged_packets_never_show_a_wrong_picture(name, request):
     plain, repaired = damage(request.getfixturevalue(name), 4_000, seed=1)
     assert set(plain) <= EARLY
     assert set(repaired) >= {
@@ -196,18 +194,16 @@ def test_damaged_packets_never_show_a_wrong_picture(
 @pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["stream", "adapting"])
-def test_a_hundred_thousand_damaged_packets_never_show_a_wrong_picture(
-    name: str, request: pytest.FixtureRequest
-) -> None:
+def test_a_hundred_thousand_damaged_packets_never_show_a_wrong_picture(name, request):
     damage(request.getfixturevalue(name), 100_000, seed=4)
 
 
-def test_only_the_digest_sees_some_flipped_bits(stream: SentStream) -> None:
+def test_only_the_digest_sees_some_flipped_bits(stream):
     _, repaired = damage(stream, 800, 1, ["flip_payload"])
     assert repaired[RejectReason.RECONSTRUCTION_MISMATCH] > 10
 
 
-def test_a_damaged_light_is_refused_or_shows_the_same(adapting: SentStream) -> None:
+def test_a_damaged_light_is_refused_or_shows_the_same(adapting):
     """The last bits of a deflated light say nothing: with others there it is the same light."""
     only = replace(adapting, frames=adapting.frames[1:2])
     _, repaired = damage(only, 400, 0, ["damage_light"])
@@ -216,7 +212,7 @@ def test_a_damaged_light_is_refused_or_shows_the_same(adapting: SentStream) -> N
     assert repaired["shown"] < 40
 
 
-def test_the_streams_have_every_kind_of_frame(stream: SentStream, adapting: SentStream) -> None:
+def test_the_streams_have_every_kind_of_frame(stream, adapting):
     packets = [frame.packet for frame in stream.frames]
     darker = [frame.packet for frame in adapting.frames]
     for some in (packets, darker):
@@ -228,7 +224,7 @@ def test_the_streams_have_every_kind_of_frame(stream: SentStream, adapting: Sent
     assert [bool(packet.light) for packet in darker] == [False, True, *[False] * (len(darker) - 2)]
 
 
-def test_every_kind_of_damage_changes_something(adapting: SentStream) -> None:
+def test_every_kind_of_damage_changes_something(adapting):
     rng, frame = np.random.default_rng(0), adapting.frames[-1]
     mutations = mutations_of(adapting)
     for name, mutation in mutations.items():
@@ -238,7 +234,7 @@ def test_every_kind_of_damage_changes_something(adapting: SentStream) -> None:
     assert len(named & held) > 1, "only the picture's digest can tell these"
 
 
-def test_a_picture_that_is_not_the_senders_is_noticed(stream: SentStream) -> None:
+def test_a_picture_that_is_not_the_senders_is_noticed(stream):
     """What is shown is compared with the digest that was sent."""
     first = stream.frames[1]
     other = replace(first.packet, reconstruction_digest=bytes(16))
@@ -248,9 +244,7 @@ def test_a_picture_that_is_not_the_senders_is_noticed(stream: SentStream) -> Non
 
 
 @pytest.mark.parametrize("repaired", [False, True])
-def test_a_render_relit_by_another_frame_that_is_kept_is_refused(
-    adapting: SentStream, repaired: bool
-) -> None:
+def test_a_render_relit_by_another_frame_that_is_kept_is_refused(adapting, repaired):
     """Only the digest of the picture can tell: the base is there, and the packet is well formed."""
     decoder = DeltaDecoder(adapting.header)
     tried = 0
@@ -267,7 +261,7 @@ def test_a_render_relit_by_another_frame_that_is_kept_is_refused(
 
 
 @pytest.mark.parametrize("repaired", [False, True])
-def test_parts_of_other_packets_are_refused(stream: SentStream, repaired: bool) -> None:
+def test_parts_of_other_packets_are_refused(stream, repaired):
     decoder = DeltaDecoder(stream.header)
     packets = [frame.packet for frame in stream.frames]
     for frame in stream.frames:
@@ -281,9 +275,7 @@ def test_parts_of_other_packets_are_refused(stream: SentStream, repaired: bool) 
 
 
 @pytest.mark.parametrize("name", ["stream", "adapting"])
-def test_a_stream_with_losses_duplicates_swaps_and_damage_shows_only_right_frames(
-    name: str, request: pytest.FixtureRequest
-) -> None:
+def test_a_stream_with_losses_duplicates_swaps_and_damage_shows_only_right_frames(name, request):
     """A good packet is taken if it is in order and the frame it is predicted from was taken."""
     stream: SentStream = request.getfixturevalue(name)
     rng = np.random.default_rng(11)

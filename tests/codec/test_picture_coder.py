@@ -1,12 +1,12 @@
 """Both coders behind one interface: one CRF, one quality; ours needs neither x264 nor a decoder."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import av
 import numpy as np
 import pytest
 
+from codec.pictures import pair
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264 import ffmpeg
 from rfcore.codec.h264.config import CodecConfig
@@ -17,7 +17,6 @@ from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView
 
-PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (320, 192)
 EFFORTS = ("fast", "default", "thorough")
 
@@ -32,7 +31,7 @@ def coded(effort: str, crf: float, pictures: tuple[I420, FieldView]) -> Encoded:
 
 
 @pytest.mark.parametrize("crf", [20.0, 26.0, 32.0])
-def test_a_crf_means_about_the_quality_it_means_to_x264(pair: PairMaker, crf: float) -> None:
+def test_a_crf_means_about_the_quality_it_means_to_x264(crf):
     """Within a step of the quantiser, half a decibel; on the sample drives within 0.1 dB, which
     ``QP_OF_CRF`` is from."""
     pictures = pair(*SIZE_PX)
@@ -43,7 +42,7 @@ def test_a_crf_means_about_the_quality_it_means_to_x264(pair: PairMaker, crf: fl
     assert ours == pytest.approx(theirs, abs=0.6)
 
 
-def test_bits_fall_with_the_crf_in_small_steps(pair: PairMaker) -> None:
+def test_bits_fall_with_the_crf_in_small_steps():
     pictures = pair(*SIZE_PX)
     sizes = [len(coded("default", crf, pictures).packet.payload) for crf in np.arange(20, 24, 0.25)]
     steps = np.diff(np.log2(sizes))
@@ -52,7 +51,7 @@ def test_bits_fall_with_the_crf_in_small_steps(pair: PairMaker) -> None:
 
 
 @pytest.mark.parametrize("effort", EFFORTS)
-def test_what_our_coder_promises_is_what_a_decoder_makes(pair: PairMaker, effort: str) -> None:
+def test_what_our_coder_promises_is_what_a_decoder_makes(effort):
     config = CodecConfig(*SIZE_PX, effort)
     checking, plain = DeltaEncoder(config, check_decode=True), DeltaEncoder(config)
     states = [checking.start(0), plain.start(0)]
@@ -65,15 +64,12 @@ def test_what_our_coder_promises_is_what_a_decoder_makes(pair: PairMaker, effort
         assert made[0].packet == made[1].packet
 
 
-def test_a_coder_that_promises_another_picture_is_found_out(
-    pair: PairMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_coder_that_promises_another_picture_is_found_out(monkeypatch):
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX), check_decode=True)
     code = encoder._coder.code
 
     def wrong(frame: I420, references: list[I420], request: CodingRequest) -> CodedPicture:
         made = code(frame, references, request)
-        assert made.reconstruction is not None
         y = made.reconstruction.y.copy()
         y[5, 5] ^= 1
         return replace(made, reconstruction=replace(made.reconstruction, y=y))
@@ -83,9 +79,7 @@ def test_a_coder_that_promises_another_picture_is_found_out(
         encoder.encode(encoder.start(0), *pair(*SIZE_PX))
 
 
-def test_our_coder_decodes_nothing_and_opens_no_encoder(
-    pair: PairMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_our_coder_decodes_nothing_and_opens_no_encoder(monkeypatch):
     """As in a runtime whose FFmpeg has no x264; the receiver opens a decoder and nothing else."""
     create = av.VideoCodecContext.create
 
@@ -108,7 +102,7 @@ def test_our_coder_decodes_nothing_and_opens_no_encoder(
 
 
 @pytest.mark.parametrize(("effort", "other"), [("fast", "x264-fast"), ("x264-fast", "fast")])
-def test_an_effort_of_the_other_coder_is_refused(pair: PairMaker, effort: str, other: str) -> None:
+def test_an_effort_of_the_other_coder_is_refused(effort, other):
     frame, view = pair(*SIZE_PX)
     coder = picture_coder(CodecConfig(*SIZE_PX, effort))
     with pytest.raises(InvalidInput, match=f"'{other}' is none of the stream's coder"):

@@ -1,6 +1,5 @@
 """Finer where a mask says so: the map's laws, and what x264 and the receiver make of it."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from numpy.typing import NDArray
 
+from codec.pictures import pair
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.qp_map import MaskSettings, QpMap, qp_map_of_mask
@@ -19,7 +18,6 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import I420, write_png
 from rfcore.views import FieldView
 
-PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (320, 192)
 MBS = (12, 20)
 
@@ -31,7 +29,7 @@ MBS = (12, 20)
         elements=st.sampled_from([0, 0, -6, 3]),
     )
 )
-def test_regions_cover_every_offset_once_and_nothing_else(offsets: NDArray[np.int8]) -> None:
+def test_regions_cover_every_offset_once_and_nothing_else(offsets):
     painted = np.zeros(offsets.shape, int)
     for region in QpMap(offsets).regions():
         rows = slice(region.y_px // 16, (region.y_px + region.height_px) // 16)
@@ -41,13 +39,13 @@ def test_regions_cover_every_offset_once_and_nothing_else(offsets: NDArray[np.in
     assert np.array_equal(painted, offsets)
 
 
-def test_a_rectangle_is_one_region() -> None:
+def test_a_rectangle_is_one_region():
     mask = np.zeros(MBS, bool)
     mask[3:9, 5:8] = True
     assert len(qp_map_of_mask(mask, SIZE_PX, -6).regions()) == 1
 
 
-def test_a_mask_of_pixels_takes_macroblocks_it_covers_a_quarter_of() -> None:
+def test_a_mask_of_pixels_takes_macroblocks_it_covers_a_quarter_of():
     mask = np.zeros((192, 320), np.uint8)
     mask[0:8, 0:8] = 255
     mask[20:23, 40:44] = 255
@@ -55,7 +53,7 @@ def test_a_mask_of_pixels_takes_macroblocks_it_covers_a_quarter_of() -> None:
     assert np.argwhere(offsets).tolist() == [[0, 0]]
 
 
-def test_macroblocks_that_the_edge_cuts_count_what_they_have() -> None:
+def test_macroblocks_that_the_edge_cuts_count_what_they_have():
     mask = np.zeros((17, 33), np.uint8)
     mask[16, 32] = 1
     offsets = qp_map_of_mask(mask, (33, 17), -6).offsets
@@ -81,7 +79,7 @@ def left_half(qp_offset: int, size_px: tuple[int, int] = SIZE_PX) -> QpMap:
 
 
 @pytest.mark.parametrize("effort", ["fast", "default", "thorough", "x264-veryfast"])
-def test_bits_go_where_the_mask_is(pair: PairMaker, effort: str) -> None:
+def test_bits_go_where_the_mask_is(effort):
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort=effort, crf=26))
     pictures = pair(*SIZE_PX)
     plain = code(encoder, pictures, FrameChoice(RENDER_ONLY, photometric=()))
@@ -94,7 +92,7 @@ def test_bits_go_where_the_mask_is(pair: PairMaker, effort: str) -> None:
     assert shown.frame.digest() == finer.reconstruction.digest()
 
 
-def test_a_map_of_nothing_changes_no_byte(pair: PairMaker) -> None:
+def test_a_map_of_nothing_changes_no_byte():
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast"))
     pictures = pair(*SIZE_PX)
     plain = code(encoder, pictures, FrameChoice(RENDER_ONLY))
@@ -104,9 +102,7 @@ def test_a_map_of_nothing_changes_no_byte(pair: PairMaker) -> None:
 
 @pytest.mark.parametrize("size_px", [(2, 2), (33, 17), (101, 67)])
 @pytest.mark.parametrize("qp_offset", [-24, 24])
-def test_odd_sizes_and_the_ends_of_the_range_decode(
-    pair: PairMaker, size_px: tuple[int, int], qp_offset: int
-) -> None:
+def test_odd_sizes_and_the_ends_of_the_range_decode(size_px, qp_offset):
     encoder = DeltaEncoder(CodecConfig(*size_px, effort="fast"))
     frame, render = pair(*size_px)
     mask = np.ones((size_px[1], size_px[0]))
@@ -117,7 +113,7 @@ def test_odd_sizes_and_the_ends_of_the_range_decode(
     assert shown.frame.digest() == made.reconstruction.digest()
 
 
-def test_maps_that_cannot_be_are_refused(pair: PairMaker) -> None:
+def test_maps_that_cannot_be_are_refused():
     for mask, offset, named in (
         (np.zeros((3, 3)), -6, r"mask: shape \(3, 3\) is neither"),
         (np.full(MBS, np.nan), -6, "NaN"),
@@ -128,7 +124,7 @@ def test_maps_that_cannot_be_are_refused(pair: PairMaker) -> None:
     with pytest.raises(InvalidInput, match="offset -30 is outside"):
         QpMap(np.full((2, 2), -30, np.int8))
     with pytest.raises(InvalidInput, match="must be int8"):
-        QpMap(np.zeros((2, 2)))  # type: ignore[arg-type]
+        QpMap(np.zeros((2, 2)))
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX))
     choice = FrameChoice(qp_map=QpMap(np.zeros((2, 2), np.int8)))
     with pytest.raises(InvalidInput, match=r"qp_map: shape \(2, 2\) where the stream has"):
@@ -143,14 +139,13 @@ def mask(tmp_path: Path) -> Path:
     return tmp_path / "mask.png"
 
 
-def test_what_is_white_in_a_masks_file_is_coded_finer(mask: Path) -> None:
+def test_what_is_white_in_a_masks_file_is_coded_finer(mask):
     qp_map = MaskSettings(mask, mask_qp=-8).qp_map((64, 48))
-    assert qp_map is not None
     assert qp_map.offsets.tolist() == [[0] * 4, [0, 0, -8, -8], [0] * 4]
     assert MaskSettings().qp_map((64, 48)) is None
 
 
-def test_a_mask_that_does_not_fit_is_refused(mask: Path, tmp_path: Path) -> None:
+def test_a_mask_that_does_not_fit_is_refused(mask, tmp_path):
     with pytest.raises(InvalidInput, match="has 64x48 px, the camera 640x360 px"):
         MaskSettings(mask).qp_map((640, 360))
     with pytest.raises(InvalidInput, match="-40 and 0 must be within"):

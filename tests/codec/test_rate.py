@@ -1,13 +1,13 @@
 """Bits are predicted before they are coded: laws of the curve and the model, then x264."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from codec.pictures import noise, pair, picture
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import INTRA, RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
@@ -22,13 +22,9 @@ from rfcore.codec.sender.rate import (
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field, render_field_view
-from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
-from rfcore.views import FieldView
 from rfedge.samples import sample_path
 
-PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (320, 192)
 
 curves = st.builds(
@@ -46,18 +42,14 @@ models = st.builds(
 
 
 @given(curve=curves, model=models, sizes=st.lists(st.floats(1e-3, 1e9), min_size=2, max_size=6))
-def test_more_bytes_are_never_a_higher_crf(
-    curve: BitsCurve, model: RateModel, sizes: list[float]
-) -> None:
+def test_more_bytes_are_never_a_higher_crf(curve, model, sizes):
     crfs = [model.crf_for(size, curve, RENDER_ONLY) for size in sorted(sizes)]
     assert crfs == sorted(crfs, reverse=True)
     assert all(curve.crfs[0] <= crf <= 51 and math.isfinite(crf) for crf in crfs)
 
 
 @given(curve=curves, octaves=st.floats(-3, 3), size_bytes=st.floats(10, 1e6))
-def test_the_crf_is_the_lowest_predicted_to_fit(
-    curve: BitsCurve, octaves: float, size_bytes: float
-) -> None:
+def test_the_crf_is_the_lowest_predicted_to_fit(curve, octaves, size_bytes):
     model = RateModel({RENDER_ONLY: octaves})
     crf = model.crf_for(size_bytes, curve, RENDER_ONLY)
     predicted = model.bytes_at(crf, curve, RENDER_ONLY)
@@ -67,7 +59,7 @@ def test_the_crf_is_the_lowest_predicted_to_fit(
 
 
 @given(curve=curves, truth=st.floats(-3, 3), wanted=st.floats(300, 1e5))
-def test_a_steady_factor_is_learnt(curve: BitsCurve, truth: float, wanted: float) -> None:
+def test_a_steady_factor_is_learnt(curve, truth, wanted):
     model = RateModel()
     for _ in range(12):
         crf = model.crf_for(wanted, curve, RENDER_ONLY)
@@ -77,22 +69,20 @@ def test_a_steady_factor_is_learnt(curve: BitsCurve, truth: float, wanted: float
     assert found == pytest.approx(coded, rel=0.02)
 
 
-def test_quality_rises_by_steps_and_falls_at_once() -> None:
+def test_quality_rises_by_steps_and_falls_at_once():
     curve = BitsCurve(np.array([20.0, 51.0]), np.array([1e6, 1e3]))
     after = RateModel({}, crf=40.0)
     assert after.crf_for(1e6, curve, RENDER_ONLY) == 40 - CLIMB_CRF
     assert after.crf_for(1e2, curve, RENDER_ONLY) > 50
 
 
-def test_what_one_set_of_references_taught_serves_for_others() -> None:
+def test_what_one_set_of_references_taught_serves_for_others():
     curve = BitsCurve(np.array([20.0, 51.0]), np.array([1e6, 1e3]))
     model = RateModel().after(30, curve, RENDER_ONLY, round(curve.at(30)))
     assert model.bytes_at(30, curve, INTRA) == pytest.approx(curve.at(30), rel=0.02)
 
 
-def test_the_curve_falls_and_more_pictures_never_cost_more(
-    pair: PairMaker, noise: PictureMaker
-) -> None:
+def test_the_curve_falls_and_more_pictures_never_cost_more():
     frame, view = pair(*SIZE_PX)
     render, costs = view.render, FrameCosts(frame)
     alone = bits_curve(costs, [render], 10)
@@ -104,27 +94,27 @@ def test_the_curve_falls_and_more_pictures_never_cost_more(
 
 
 @pytest.mark.parametrize("size_px", [(2, 2), (7, 40), (33, 17)])
-def test_pictures_of_odd_sizes_have_curves(picture: PictureMaker, size_px: tuple[int, int]) -> None:
+def test_pictures_of_odd_sizes_have_curves(size_px):
     frame = picture(*size_px)
     for pictures in ([], [frame]):
         assert np.isfinite(bits_curve(FrameCosts(frame), pictures, 1).bits).all()
 
 
 @pytest.mark.parametrize("crf", [0.5, 51.5, float("nan")])
-def test_a_crf_out_of_range_is_refused(pair: PairMaker, crf: float) -> None:
+def test_a_crf_out_of_range_is_refused(crf):
     with pytest.raises(InvalidInput, match=r"outside 1..51"):
         bits_curve(FrameCosts(pair(32, 32)[0]), [], crf)
 
 
 @pytest.mark.parametrize("size_bytes", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_target_that_cannot_be_is_refused(size_bytes: float) -> None:
+def test_a_target_that_cannot_be_is_refused(size_bytes):
     with pytest.raises(InvalidInput, match=r"target\.size_bytes"):
         RateTarget(size_bytes)
 
 
 @pytest.mark.sample
 @pytest.mark.slow
-def test_drives_meet_their_targets_within_a_twentieth() -> None:
+def test_drives_meet_their_targets_within_a_twentieth():
     """Each frame coded once; the first three teach the factor. Half of the rest, over all targets,
     miss by less; at a single target the median may be a little above."""
     misses = [misses_of_a_drive(size_bytes)[3:] for size_bytes in (2000, 4000, 8000, 16000)]
@@ -139,10 +129,10 @@ def misses_of_a_drive(size_bytes: int) -> list[float]:
     k = pictures[0].camera.intrinsics
     encoder = DeltaEncoder(CodecConfig(k.width_px, k.height_px, crf=1))
     state, model, misses = encoder.start(0), RateModel(), []
-    for picture in pictures:
-        view = render_field_view(field, picture.camera.rounded())
+    for shot in pictures:
+        view = render_field_view(field, shot.camera.rounded())
         choice = FrameChoice(target=RateTarget(size_bytes, model))
-        made = encoder.encode(state, i420_from_rgb(picture.read()), view, choice)
+        made = encoder.encode(state, i420_from_rgb(shot.read()), view, choice)
         assert made.rate is not None
         assert made.tries == 1
         state, model = made.state, made.rate
@@ -150,7 +140,7 @@ def misses_of_a_drive(size_bytes: int) -> list[float]:
     return misses
 
 
-def test_a_coder_meets_a_target(pair: PairMaker) -> None:
+def test_a_coder_meets_a_target():
     """Within a third once one frame has taught the factor; pictures differ by their shift."""
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast"))
     state, model, misses = encoder.start(0), RateModel(), []
@@ -166,7 +156,7 @@ def test_a_coder_meets_a_target(pair: PairMaker) -> None:
     assert max(map(abs, misses[3:])) < math.log2(4 / 3)
 
 
-def test_a_target_never_goes_below_the_crf_asked_for(pair: PairMaker) -> None:
+def test_a_target_never_goes_below_the_crf_asked_for():
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast", crf=30))
     choice = FrameChoice(RENDER_ONLY, target=RateTarget(1e6))
     made = encoder.encode(encoder.start(0), *pair(*SIZE_PX), choice=choice)

@@ -1,11 +1,11 @@
 """What the sender decides: references by their use, light only when it pays."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from codec.pictures import noise, pair, picture, view_of
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
@@ -23,8 +23,6 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView
 
-PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (320, 192)
 
 
@@ -46,12 +44,12 @@ def shade(picture: I420, gain: float, levels: float) -> I420:
 # --- references
 
 
-def test_a_render_like_the_frame_is_enough(pair: PairMaker) -> None:
+def test_a_render_like_the_frame_is_enough():
     frame, view = pair(*SIZE_PX)
     assert choose_references(FrameCosts(frame), Prediction(view), 23) == RENDER_ONLY
 
 
-def test_a_render_that_shows_nothing_is_not_used(pair: PairMaker, noise: PictureMaker) -> None:
+def test_a_render_that_shows_nothing_is_not_used():
     frame, view = pair(*SIZE_PX)
     for render in (noise(*SIZE_PX, 1), shade(noise(*SIZE_PX, 2), 1.0, 0.0)):
         useless = wall(render)
@@ -62,7 +60,7 @@ def test_a_render_that_shows_nothing_is_not_used(pair: PairMaker, noise: Picture
     assert choose_references(FrameCosts(frame), Prediction(view), 23) == RENDER_ONLY
 
 
-def test_what_the_last_frame_taught_comes_first(pair: PairMaker) -> None:
+def test_what_the_last_frame_taught_comes_first():
     """The cars are not in the render; nobody moved, so the correction has them."""
     frame, view = pair(*SIZE_PX)
     now = wall(view.render)
@@ -74,7 +72,7 @@ def test_what_the_last_frame_taught_comes_first(pair: PairMaker) -> None:
 FIELD_REFERENCES = {Reference.RENDER, Reference.CORRECTION, Reference.WARP}
 
 
-def half_known(pair: PairMaker, noise: PictureMaker) -> tuple[I420, Prediction]:
+def half_known() -> tuple[I420, Prediction]:
     """A frame whose cars only the last frame had; left of the middle that one was noise."""
     frame, view = pair(*SIZE_PX)
     now = wall(view.render)
@@ -84,11 +82,9 @@ def half_known(pair: PairMaker, noise: PictureMaker) -> tuple[I420, Prediction]:
     return frame, Prediction(now, Past(last, now))
 
 
-def test_a_second_picture_of_the_field_is_taken_where_it_saves(
-    pair: PairMaker, noise: PictureMaker
-) -> None:
+def test_a_second_picture_of_the_field_is_taken_where_it_saves():
     """The render has the left half, what was carried from the last frame the right one."""
-    frame, prediction = half_known(pair, noise)
+    frame, prediction = half_known()
     chosen = choose_references(FrameCosts(frame), prediction, 23)
     assert chosen[0] is Reference.PREVIOUS
     assert set(chosen[1:]) > {Reference.RENDER}
@@ -96,9 +92,7 @@ def test_a_second_picture_of_the_field_is_taken_where_it_saves(
     assert len(chosen) == 3
 
 
-def test_no_second_picture_of_the_field_is_taken_where_the_first_has_everything(
-    pair: PairMaker,
-) -> None:
+def test_no_second_picture_of_the_field_is_taken_where_the_first_has_everything():
     frame, view = pair(*SIZE_PX)
     now = wall(view.render)
     chosen = choose_references(FrameCosts(frame), Prediction(now, Past(frame, now)), 23)
@@ -106,7 +100,7 @@ def test_no_second_picture_of_the_field_is_taken_where_the_first_has_everything(
 
 
 @pytest.mark.parametrize("max_references", [1, 2, 3, 4])
-def test_no_more_references_than_allowed(pair: PairMaker, max_references: int) -> None:
+def test_no_more_references_than_allowed(max_references):
     frame, view = pair(*SIZE_PX)
     now = wall(view.render)
     prediction = Prediction(now, Past(frame, now))
@@ -117,9 +111,7 @@ def test_no_more_references_than_allowed(pair: PairMaker, max_references: int) -
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (7, 40), (40, 7)])
-def test_pictures_smaller_than_a_block_have_the_render(
-    picture: PictureMaker, view_of: Callable[[I420], FieldView], size_px: tuple[int, int]
-) -> None:
+def test_pictures_smaller_than_a_block_have_the_render(size_px):
     frame = picture(*size_px)
     assert choose_references(FrameCosts(frame), Prediction(view_of(frame)), 23) == RENDER_ONLY
     assert not light_differs(shade(frame, 0.5, 0.0), view_of(frame).render)
@@ -129,9 +121,7 @@ def test_pictures_smaller_than_a_block_have_the_render(
 
 
 @pytest.mark.parametrize(("gain", "levels"), [(0.6, 0.0), (0.8, 12.0), (1.3, -6.0), (1.0, 20.0)])
-def test_a_change_of_light_is_found_and_undone(
-    picture: PictureMaker, gain: float, levels: float
-) -> None:
+def test_a_change_of_light_is_found_and_undone(gain, levels):
     """Rounding twice leaves at most one level each: shading and adapting."""
     frame, render = shade(picture(*SIZE_PX), gain, levels), picture(*SIZE_PX)
     undone = adapt(render, solve(frame, render))
@@ -141,9 +131,7 @@ def test_a_change_of_light_is_found_and_undone(
 
 
 @pytest.mark.parametrize("size_px", [(640, 360), (828, 250), (1242, 376), (1281, 721), (64, 48)])
-def test_a_wide_picture_has_no_more_equations_than_another(
-    picture: PictureMaker, size_px: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wide_picture_has_no_more_equations_than_another(size_px, monkeypatch):
     """With as many as its height let in, one of 828x250 took 72 ms instead of 3."""
     equations = []
     lstsq = np.linalg.lstsq
@@ -159,7 +147,7 @@ def test_a_wide_picture_has_no_more_equations_than_another(
     assert abs(matrix[0, 0] / 4096 - 0.8) < 0.01
 
 
-def test_what_the_field_has_never_seen_does_not_bend_the_light(pair: PairMaker) -> None:
+def test_what_the_field_has_never_seen_does_not_bend_the_light():
     frame, view = pair(*SIZE_PX)
     dark = shade(frame, 0.7, 0.0)
     matrix = np.array(solve(dark, view.render)).reshape(3, 4)
@@ -167,7 +155,7 @@ def test_what_the_field_has_never_seen_does_not_bend_the_light(pair: PairMaker) 
     assert abs(matrix[0, 3] / 16) < 3
 
 
-def test_light_is_sent_when_it_pays_and_beats_weighted_prediction(pair: PairMaker) -> None:
+def test_light_is_sent_when_it_pays_and_beats_weighted_prediction():
     """A warm light moves chroma with luma, which a gain and an offset a plane cannot say."""
     frame, render = pair(*SIZE_PX)
     warm = adapt(frame, (3300, 0, 0, 0, -500, 3300, 0, 0, 600, 0, 3300, 0))
@@ -183,7 +171,7 @@ def test_light_is_sent_when_it_pays_and_beats_weighted_prediction(pair: PairMake
     assert decoded.frame.digest() == sent.reconstruction.digest()
 
 
-def test_light_that_did_not_change_is_not_sent(pair: PairMaker, noise: PictureMaker) -> None:
+def test_light_that_did_not_change_is_not_sent():
     frame, view = pair(*SIZE_PX)
     assert not light_differs(frame, view.render)
     assert choose_photometric(FrameCosts(frame), view.render, 23) == ()
@@ -191,9 +179,7 @@ def test_light_that_did_not_change_is_not_sent(pair: PairMaker, noise: PictureMa
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (2, 2), (3, 5), (101, 67)])
-def test_the_identity_changes_no_sample_above_zero(
-    noise: PictureMaker, size_px: tuple[int, int]
-) -> None:
+def test_the_identity_changes_no_sample_above_zero(size_px):
     picture = noise(*size_px, 1)
     identity = (4096, 0, 0, 0, 0, 4096, 0, 0, 0, 0, 4096, 0)
     for a, b in zip(adapt(picture, identity).planes, picture.planes, strict=True):
@@ -202,7 +188,7 @@ def test_the_identity_changes_no_sample_above_zero(
 
 
 @pytest.mark.parametrize("size_px", [(4, 2), (5, 3)])
-def test_adapting_is_its_definition(noise: PictureMaker, size_px: tuple[int, int]) -> None:
+def test_adapting_is_its_definition(size_px):
     """Sample by sample in Python's integers, with the largest numbers there may be."""
     picture = noise(*size_px, 3)
     rng = np.random.default_rng(1)
@@ -227,7 +213,7 @@ def test_adapting_is_its_definition(noise: PictureMaker, size_px: tuple[int, int
             assert got.v[j, i] == value(2, mean, i, j, 128)
 
 
-def test_numbers_that_cannot_be_are_refused(pair: PairMaker) -> None:
+def test_numbers_that_cannot_be_are_refused():
     for numbers, named in (((1, 2), "2 numbers"), ((1 << 15, *[0] * 11), "32768 is outside")):
         with pytest.raises(InvalidInput, match=named):
             check_photometric(numbers)

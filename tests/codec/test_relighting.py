@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from codec.pictures import evening, noise, pair
 from codec.sent_streams import exchange
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
@@ -18,9 +19,6 @@ from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 from rfcore.views import FieldView
 
-PairMaker = Callable[..., tuple[I420, FieldView]]
-EveningMaker = Callable[[I420, float], I420]
-Street = Callable[[int], tuple[I420, FieldView]]
 SIZE_PX = (320, 192)
 FRAMES = 4
 NEVER = FrameChoice(relight=False)
@@ -30,24 +28,19 @@ def encoder_of(size_px: tuple[int, int] = SIZE_PX) -> DeltaEncoder:
     return DeltaEncoder(CodecConfig(*size_px))
 
 
-@pytest.fixture(scope="module")
-def street(pair: PairMaker, evening: EveningMaker) -> Street:
-    """Say what is seen of moment ``index``, and what the field shows: at dusk, against noon."""
-
-    def at(index: int) -> tuple[I420, FieldView]:
-        frame, view = pair(*SIZE_PX, 3.0 * index)
-        return evening(frame, 1.0), view
-
-    return at
+def street(index: int) -> tuple[I420, FieldView]:
+    """Return what is seen of moment ``index``, and what the field shows: at dusk, against noon."""
+    frame, view = pair(*SIZE_PX, 3.0 * index)
+    return evening(frame, 1.0), view
 
 
-def coded(encoder: DeltaEncoder, street: Street, choice: FrameChoice) -> list[Encoded]:
+def coded(encoder: DeltaEncoder, choice: FrameChoice) -> list[Encoded]:
     return exchange(encoder, map(street, range(FRAMES)), [choice] * FRAMES)
 
 
-def test_frames_under_another_light_are_relit_and_decode_as_promised(street: Street) -> None:
+def test_frames_under_another_light_are_relit_and_decode_as_promised():
     encoder = encoder_of()
-    relit, plain = (coded(encoder, street, choice) for choice in (FrameChoice(), NEVER))
+    relit, plain = (coded(encoder, choice) for choice in (FrameChoice(), NEVER))
     assert [bool(made.packet.light) for made in relit] == [True] + [False] * (FRAMES - 1)
     assert all(made.packet.relit for made in relit)
     assert not any(made.packet.relit for made in plain)
@@ -56,16 +49,14 @@ def test_frames_under_another_light_are_relit_and_decode_as_promised(street: Str
         assert told < 0.9 * len(without.packet.payload)
 
 
-def test_no_light_is_sent_for_a_field_of_something_else(
-    street: Street, noise: Callable[..., I420]
-) -> None:
+def test_no_light_is_sent_for_a_field_of_something_else():
     frame, view = street(0)
     encoder = encoder_of()
     elsewhere = replace(view, render=noise(*SIZE_PX, 3))
     assert not encoder.encode(encoder.start(1), frame, elsewhere).packet.light
 
 
-def test_a_light_is_of_a_relit_frame_and_under_its_crc(street: Street) -> None:
+def test_a_light_is_of_a_relit_frame_and_under_its_crc():
     encoder = encoder_of()
     packet = encoder.encode(encoder.start(1), *street(0)).packet
     with pytest.raises(InvalidInput, match=r"packet\.light"):
@@ -89,7 +80,7 @@ def test_a_light_is_of_a_relit_frame_and_under_its_crc(street: Street) -> None:
             assert refused.value.reason is expected
 
 
-def test_the_right_light_costs_nothing(pair: PairMaker) -> None:
+def test_the_right_light_costs_nothing():
     encoder = encoder_of()
     states = [encoder.start(1)] * 2
     for index in range(3):
@@ -102,24 +93,7 @@ def test_the_right_light_costs_nothing(pair: PairMaker) -> None:
         states = [made.state for made in both]
 
 
-def test_a_lost_frame_costs_one_packet(street: Street) -> None:
-    """The sender goes on from the frame that is known to have arrived."""
-    encoder = encoder_of()
-    first = encoder.encode(encoder.start(1), *street(0))
-    lost = encoder.encode(first.state, *street(1))
-    base = replace(lost.state, past=first.state.past)
-    third = encoder.encode(base, *street(2))
-    assert third.packet.relit
-    decoder = DeltaDecoder(encoder.header)
-    state = decoder.decode(decoder.start(1), first.packet, street(0)[1]).state
-    decoded = decoder.decode(state, third.packet, street(2)[1])
-    assert decoded.frame.digest() == third.reconstruction.digest()
-    with pytest.raises(PacketRejected) as refused:
-        decoder.decode(decoder.start(1), lost.packet, street(1)[1])
-    assert refused.value.reason is RejectReason.UNKNOWN_STATE
-
-
-def test_a_frame_that_may_need_nothing_but_its_render_is_not_relit(street: Street) -> None:
+def test_a_frame_that_may_need_nothing_but_its_render_is_not_relit():
     encoder = encoder_of()
     first = encoder.encode(encoder.start(1), *street(0))
     alone = encoder.encode(first.state, *street(1), FrameChoice(RENDER_ONLY))
@@ -130,14 +104,14 @@ def test_a_frame_that_may_need_nothing_but_its_render_is_not_relit(street: Stree
     assert not encoder.encode(first.state, street(1)[0], nothing, lost).packet.relit
 
 
-def test_relighting_the_render_alone_still_names_the_frame_it_learns_from(street: Street) -> None:
+def test_relighting_the_render_alone_still_names_the_frame_it_learns_from():
     choices = [FrameChoice(), FrameChoice(RENDER_ONLY, relight=True)]
     first, second = exchange(encoder_of(), map(street, range(2)), choices)
     assert second.packet.references == RENDER_ONLY
     assert first.reconstruction.digest().startswith(second.packet.base_digest)
 
 
-def test_a_sender_without_an_earlier_frame_cannot_be_told_to(street: Street) -> None:
+def test_a_sender_without_an_earlier_frame_cannot_be_told_to():
     encoder = encoder_of()
     with pytest.raises(InvalidInput, match="no earlier frame"):
         encoder.encode(encoder.start(1), *street(0), FrameChoice(relight=True))
@@ -145,15 +119,15 @@ def test_a_sender_without_an_earlier_frame_cannot_be_told_to(street: Street) -> 
         FrameChoice(photometric=(4096,) * 12, relight=True)
 
 
-def test_a_packet_is_relit_by_a_frame_or_changed_by_numbers(street: Street) -> None:
-    packet = coded(encoder_of(), street, FrameChoice())[1].packet
+def test_a_packet_is_relit_by_a_frame_or_changed_by_numbers():
+    packet = coded(encoder_of(), FrameChoice())[1].packet
     with pytest.raises(InvalidInput, match="relit"):
         replace(packet, photometric=(4096, 0, 0, 0, 0, 4096, 0, 0, 0, 0, 4096, 0))
     with pytest.raises(InvalidInput, match="base_digest"):
         replace(packet, references=(Reference.RENDER,), base_digest=b"")
 
 
-def test_a_receiver_whose_renderer_is_not_exact_refuses(street: Street) -> None:
+def test_a_receiver_whose_renderer_is_not_exact_refuses():
     encoder = encoder_of()
     first = encoder.encode(encoder.start(1), *street(0), FrameChoice(block_means=True))
     choice = FrameChoice(RENDER_ONLY, relight=True, block_means=True)
@@ -269,9 +243,7 @@ def bits_ratio(auto: CodedSweep, off: CodedSweep, frames: slice) -> float:
 
 
 @pytest.mark.parametrize("name", SWEEPS)
-def test_light_that_changes_never_costs_more_than_off_and_no_decision_flaps(
-    pair: PairMaker, evening: EveningMaker, name: str
-) -> None:
+def test_light_that_changes_never_costs_more_than_off_and_no_decision_flaps(name):
     sweep = SWEEPS[name]
     light = sweep.light or (lambda picture, index: evening(picture, index / sweep.frames))
     given = [pair(*SMALL_PX, 1.5 * index) for index in range(sweep.frames)]
@@ -285,9 +257,7 @@ def test_light_that_changes_never_costs_more_than_off_and_no_decision_flaps(
     assert not auto.relit.all()
 
 
-def test_a_lost_frame_costs_one_packet_while_the_light_fades(
-    pair: PairMaker, evening: EveningMaker
-) -> None:
+def test_a_lost_frame_costs_one_packet_while_the_light_fades():
     """Every fifth frame is lost; the sender goes on from the last one that arrived."""
     encoder = DeltaEncoder(CodecConfig(*SMALL_PX))
     decoder = DeltaDecoder(encoder.header)

@@ -125,12 +125,7 @@ def openh264() -> Callable[[bytes, tuple[int, int], Path], list[bytes]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size_px", [(176, 144), (64, 48), (320, 176)])
-def test_openh264_and_ffmpeg_show_the_same_pictures(
-    size_px: tuple[int, int],
-    openh264: Callable[[bytes, tuple[int, int], Path], list[bytes]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
+def test_openh264_and_ffmpeg_show_the_same_pictures(size_px, openh264, monkeypatch, tmp_path):
     recording = record(size_px, monkeypatch)
     assert len(recording.pictures) == PICTURES
     check_both_show(recording, PICTURES, openh264(b"".join(recording.units), size_px, tmp_path))
@@ -139,11 +134,8 @@ def test_openh264_and_ffmpeg_show_the_same_pictures(
 @pytest.mark.slow
 @pytest.mark.parametrize("size_px", [(176, 144), (72, 56), (1280, 720)])
 def test_openh264_and_ffmpeg_agree_on_every_mode_of_our_own_slices(
-    size_px: tuple[int, int],
-    openh264: Callable[[bytes, tuple[int, int], Path], list[bytes]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
+    size_px, openh264, monkeypatch, tmp_path
+):
     recording, pictures = record_own_slices(size_px, monkeypatch)
     check_both_show(recording, pictures, openh264(b"".join(recording.units), size_px, tmp_path))
 

@@ -46,9 +46,7 @@ def written(data: bytes, step: int = 4) -> bytes:
     seed=st.integers(0, 2**32 - 1),
     darkest=st.floats(0.0, 1.2),
 )
-def test_what_is_read_is_what_was_written(
-    size_px: tuple[int, int], seed: int, darkest: float
-) -> None:
+def test_what_is_read_is_what_was_written(size_px, seed, darkest):
     render = street(size_px, seed)
     frame = lamplit(render, darkest)
     light = sent_light(frame, render)
@@ -60,7 +58,7 @@ def test_what_is_read_is_what_was_written(
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_it_says_most_of_what_another_light_changes() -> None:
+def test_it_says_most_of_what_another_light_changes():
     render = street(SIZE_PX, 1)
     frame = lamplit(render, 0.4)
     light = sent_light(frame, render)
@@ -68,7 +66,7 @@ def test_it_says_most_of_what_another_light_changes() -> None:
     assert error(lit_by(render, light), frame) < 0.1 * error(render, frame)
 
 
-def test_a_light_of_a_large_picture_is_coarser_or_none() -> None:
+def test_a_light_of_a_large_picture_is_coarser_or_none():
     size_px = (1920, 1080)
     render = street(size_px, 1)
     light = sent_light(lamplit(render, 0.4), render)
@@ -111,7 +109,7 @@ COUNT = int(np.prod(light_shape(SIZE_PX)))
         "far",
     ],
 )
-def test_what_is_no_light_is_refused(light: bytes, problem: str) -> None:
+def test_what_is_no_light_is_refused(light, problem):
     render = street(SIZE_PX, 1)
     for plane in lit_by(render, written(bytes(COUNT))).planes:
         assert plane.any()

@@ -1,11 +1,11 @@
 """Both ends hold the same picture, at every size, for every frame, whatever the content."""
 
-from collections.abc import Callable
 from itertools import product
 
 import numpy as np
 import pytest
 
+from codec.pictures import flat, noise, pair, picture, view_of
 from codec.sent_streams import exchange
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import join_nals
@@ -15,10 +15,6 @@ from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.codec.sender.picture_coder import slice_options
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.views import FieldView
-
-PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, FieldView]]
 
 SIZES = [(2, 2), (3, 5), (16, 16), (18, 34), (300, 168), (301, 169), (720, 404), (2, 1000)]
 
@@ -29,9 +25,7 @@ def psnr_y_db(a: I420, b: I420) -> float:
 
 
 @pytest.mark.parametrize(("width_px", "height_px"), SIZES)
-def test_the_receiver_gets_the_senders_reconstruction_on_every_frame(
-    width_px: int, height_px: int, pair: PairMaker
-) -> None:
+def test_the_receiver_gets_the_senders_reconstruction_on_every_frame(width_px, height_px):
     encoder = DeltaEncoder(CodecConfig(width_px, height_px))
     exchange(encoder, (pair(width_px, height_px, 3.0 * index) for index in range(4)))
 
@@ -39,7 +33,7 @@ def test_the_receiver_gets_the_senders_reconstruction_on_every_frame(
 @pytest.mark.parametrize(
     ("width_px", "height_px"), [(1920, 1080), pytest.param(4096, 2304, marks=pytest.mark.slow)]
 )
-def test_large_pictures_splice(width_px: int, height_px: int, pair: PairMaker) -> None:
+def test_large_pictures_splice(width_px, height_px):
     frame, render = pair(width_px, height_px)
     encoder = DeltaEncoder(CodecConfig(width_px, height_px, effort="fast"))
     (encoded,) = exchange(encoder, [(frame, render)])
@@ -53,16 +47,7 @@ CONTENTS = ["street", "black", "white", "zero", "full", "noise"]
     ("crf", "effort"), [(1.0, "fast"), (51.0, "default"), (1.0, "x264-veryfast")]
 )
 @pytest.mark.parametrize(("seen", "rendered"), list(product(CONTENTS, CONTENTS)))
-def test_any_frame_against_any_render_splices_at_extreme_quantisers(
-    seen: str,
-    rendered: str,
-    crf: float,
-    effort: str,
-    picture: PictureMaker,
-    flat: PictureMaker,
-    noise: PictureMaker,
-    view_of: Callable[[I420], FieldView],
-) -> None:
+def test_any_frame_against_any_render_splices_at_extreme_quantisers(seen, rendered, crf, effort):
     make = {
         "street": lambda seed: picture(66, 50, seed),
         "black": lambda _: flat(66, 50, 16),
@@ -79,9 +64,7 @@ def test_any_frame_against_any_render_splices_at_extreme_quantisers(
 
 @pytest.mark.parametrize("crf", [18, 23, 28])
 @pytest.mark.parametrize("preset", ["veryfast", "medium"])
-def test_the_splice_loses_less_than_a_tenth_of_a_decibel_to_what_x264_meant(
-    preset: str, crf: float, pair: PairMaker
-) -> None:
+def test_the_splice_loses_less_than_a_tenth_of_a_decibel_to_what_x264_meant(preset, crf):
     """It may gain: where nothing changed the splice shows the render itself, x264 a coded one."""
     frame, render = pair(320, 192)
     config = CodecConfig(320, 192, effort_of_preset(preset), crf)
@@ -97,7 +80,7 @@ def test_the_splice_loses_less_than_a_tenth_of_a_decibel_to_what_x264_meant(
     assert psnr_y_db(encoded.reconstruction, frame) > psnr_y_db(meant, frame) - 0.1
 
 
-def test_the_same_frames_give_the_same_packets(pair: PairMaker) -> None:
+def test_the_same_frames_give_the_same_packets():
     def run() -> list[object]:
         encoder = DeltaEncoder(CodecConfig(160, 90))
         made = exchange(encoder, (pair(160, 90, index) for index in range(3)))
@@ -106,14 +89,14 @@ def test_the_same_frames_give_the_same_packets(pair: PairMaker) -> None:
     assert run() == run()
 
 
-def test_any_receiver_takes_the_packets_of_an_encoder_of_two_threads(pair: PairMaker) -> None:
+def test_any_receiver_takes_the_packets_of_an_encoder_of_two_threads():
     encoder = DeltaEncoder(CodecConfig(160, 90), threads=2)
     exchange(encoder, (pair(160, 90, index) for index in range(3)))
     with pytest.raises(InvalidInput, match="threads: 0"):
         DeltaEncoder(CodecConfig(160, 90), threads=0)
 
 
-def test_a_packet_does_not_depend_on_the_frames_before_it(pair: PairMaker) -> None:
+def test_a_packet_does_not_depend_on_the_frames_before_it():
     encoder = DeltaEncoder(CodecConfig(160, 90))
     state = encoder.start(1)
     first = encoder.encode(state, *pair(160, 90, 1)).packet
@@ -121,7 +104,7 @@ def test_a_packet_does_not_depend_on_the_frames_before_it(pair: PairMaker) -> No
     assert encoder.encode(state, *pair(160, 90, 1)).packet == first
 
 
-def test_stage_times_come_from_the_clock_given(pair: PairMaker) -> None:
+def test_stage_times_come_from_the_clock_given():
     ticks = iter(range(0, 1000, 10))
     encoder = DeltaEncoder(CodecConfig(32, 32), clock_ns=lambda: next(ticks))
     frame, render = pair(32, 32)

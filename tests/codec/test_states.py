@@ -1,12 +1,12 @@
 """References in every mode and order; states that are named, kept, lost and returned to."""
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+from codec.pictures import pair
 from codec.sent_streams import exchange
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
@@ -17,8 +17,6 @@ from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 from rfcore.views import FieldView
 
-PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (160, 96)
 WALL_M = 10.0
 TEMPORAL = [
@@ -37,7 +35,7 @@ class Moment:
     view: FieldView
 
 
-def moment(pair: PairMaker, index: int, size_px: tuple[int, int] = SIZE_PX) -> Moment:
+def moment(index: int, size_px: tuple[int, int] = SIZE_PX) -> Moment:
     """The camera moves so that the picture shifts by 2 px a frame: f x / z of a wall."""
     width, height = size_px
     frame, still = pair(width, height, 2.0 * index)
@@ -59,14 +57,12 @@ def encoder() -> DeltaEncoder:
 
 
 @pytest.fixture
-def moments(pair: PairMaker) -> list[Moment]:
-    return [moment(pair, index) for index in range(8)]
+def moments() -> list[Moment]:
+    return [moment(index) for index in range(8)]
 
 
 @pytest.mark.parametrize("references", [INTRA, RENDER_ONLY, *TEMPORAL])
-def test_every_mode_and_order_reconstructs_exactly(
-    encoder: DeltaEncoder, moments: list[Moment], references: tuple[Reference, ...]
-) -> None:
+def test_every_mode_and_order_reconstructs_exactly(encoder, moments, references):
     pictures = [(now.frame, now.view) for now in moments[:2]]
     _, second = exchange(encoder, pictures, [FrameChoice(), FrameChoice(references)])
     assert second.packet.references == references
@@ -75,22 +71,20 @@ def test_every_mode_and_order_reconstructs_exactly(
 @pytest.mark.parametrize(
     "size_px", [(2, 2), (3, 5), (16, 16), (18, 34), (101, 67), (300, 168), (641, 359)]
 )
-def test_three_references_work_at_any_size(pair: PairMaker, size_px: tuple[int, int]) -> None:
+def test_three_references_work_at_any_size(size_px):
     three = FrameChoice((Reference.WARP, Reference.PREVIOUS, Reference.RENDER))
-    pictures = [(now.frame, now.view) for now in (moment(pair, i, size_px) for i in range(3))]
+    pictures = [(now.frame, now.view) for now in (moment(i, size_px) for i in range(3))]
     encoder = DeltaEncoder(CodecConfig(*size_px, effort="fast"))
     exchange(encoder, pictures, [FrameChoice(), three, three])
 
 
 @pytest.mark.slow
-def test_three_references_work_at_the_largest_size(pair: PairMaker) -> None:
-    test_three_references_work_at_any_size(pair, (4096, 2304))
+def test_three_references_work_at_the_largest_size():
+    test_three_references_work_at_any_size((4096, 2304))
 
 
 @pytest.mark.parametrize("reference", list(Reference))
-def test_a_pose_only_packet_shows_the_reference_as_it_is(
-    encoder: DeltaEncoder, moments: list[Moment], reference: Reference
-) -> None:
+def test_a_pose_only_packet_shows_the_reference_as_it_is(encoder, moments, reference):
     pictures = [(now.frame, now.view) for now in moments[:2]]
     choices = [FrameChoice(), FrameChoice((reference,), pose_only=True)]
     _, bare = exchange(encoder, pictures, choices)
@@ -99,7 +93,7 @@ def test_a_pose_only_packet_shows_the_reference_as_it_is(
         assert np.array_equal(bare.reconstruction.y, moments[1].view.render.y)
 
 
-def test_the_states_of_a_stream_form_a_chain(encoder: DeltaEncoder, moments: list[Moment]) -> None:
+def test_the_states_of_a_stream_form_a_chain(encoder, moments):
     state, made = encoder.start(0), b""
     for now in moments[:4]:
         sent = send(encoder, state, now)
@@ -107,9 +101,7 @@ def test_the_states_of_a_stream_form_a_chain(encoder: DeltaEncoder, moments: lis
         made, state = sent.packet.reconstruction_digest, sent.state
 
 
-def test_earlier_frames_save_bytes_where_the_field_knows_nothing(
-    encoder: DeltaEncoder, moments: list[Moment]
-) -> None:
+def test_earlier_frames_save_bytes_where_the_field_knows_nothing(encoder, moments):
     """The cars are not in the render, but they were in the frame before."""
     first = send(encoder, encoder.start(0), moments[0])
     alone = send(encoder, first.state, moments[1], FrameChoice(RENDER_ONLY))
@@ -117,9 +109,7 @@ def test_earlier_frames_save_bytes_where_the_field_knows_nothing(
     assert len(both.packet.payload) < 0.8 * len(alone.packet.payload)
 
 
-def test_a_frame_whose_base_was_lost_is_refused_and_rolling_back_heals_it(
-    encoder: DeltaEncoder, moments: list[Moment]
-) -> None:
+def test_a_frame_whose_base_was_lost_is_refused_and_rolling_back_heals_it(encoder, moments):
     decoder = DeltaDecoder(encoder.header)
     first = send(encoder, encoder.start(0), moments[0])
     lost = send(encoder, first.state, moments[1])
@@ -135,9 +125,7 @@ def test_a_frame_whose_base_was_lost_is_refused_and_rolling_back_heals_it(
     assert healed.frame.digest() == again.reconstruction.digest()
 
 
-def test_the_receiver_keeps_a_bounded_number_of_frames(
-    encoder: DeltaEncoder, moments: list[Moment]
-) -> None:
+def test_the_receiver_keeps_a_bounded_number_of_frames(encoder, moments):
     decoder = DeltaDecoder(encoder.header)
     sending, receiving = encoder.start(0), decoder.start(0)
     first = None
@@ -147,14 +135,11 @@ def test_the_receiver_keeps_a_bounded_number_of_frames(
         got = decoder.decode(receiving, sent.packet, now.view)
         sending, receiving = sent.state, got.state
     assert len(receiving.kept) == KEPT_FRAMES
-    assert first is not None
     assert receiving.past(first.packet.reconstruction_digest) is None
     assert receiving.past(sent.packet.reconstruction_digest) is receiving.kept[0]
 
 
-def test_between_inexact_renderers_only_the_render_is_taken(
-    encoder: DeltaEncoder, moments: list[Moment]
-) -> None:
+def test_between_inexact_renderers_only_the_render_is_taken(encoder, moments):
     decoder = DeltaDecoder(encoder.header, exact=False)
     first = send(encoder, encoder.start(0), moments[0])
     got = decoder.decode(decoder.start(0), first.packet, moments[0].view)
@@ -165,17 +150,13 @@ def test_between_inexact_renderers_only_the_render_is_taken(
 
 
 @pytest.mark.parametrize("reference", [Reference.PREVIOUS, Reference.WARP, Reference.CORRECTION])
-def test_the_first_frame_has_no_earlier_one_to_predict_from(
-    encoder: DeltaEncoder, moments: list[Moment], reference: Reference
-) -> None:
+def test_the_first_frame_has_no_earlier_one_to_predict_from(encoder, moments, reference):
     with pytest.raises(InvalidInput, match="no earlier frame to predict from"):
         send(encoder, encoder.start(0), moments[0], FrameChoice((reference,)))
 
 
 @pytest.mark.parametrize("reference", [Reference.WARP, Reference.CORRECTION])
-def test_where_the_field_has_no_depth_what_is_carried_is_the_render(
-    encoder: DeltaEncoder, moments: list[Moment], reference: Reference
-) -> None:
+def test_where_the_field_has_no_depth_what_is_carried_is_the_render(encoder, moments, reference):
     flat = [replace(now, view=replace(now.view, depth=0 * now.view.depth)) for now in moments]
     first = send(encoder, encoder.start(0), flat[0])
     bare = send(encoder, first.state, flat[1], FrameChoice((reference,), pose_only=True))
@@ -183,13 +164,10 @@ def test_where_the_field_has_no_depth_what_is_carried_is_the_render(
         assert np.array_equal(made, rendered)
 
 
-def test_a_kept_frame_drops_the_opacity_that_nobody_asks_for(
-    encoder: DeltaEncoder, moments: list[Moment]
-) -> None:
+def test_a_kept_frame_drops_the_opacity_that_nobody_asks_for(encoder, moments):
     now = moments[0]
     opaque = replace(now.view, opacity=np.ones_like(now.view.depth))
     past = send(encoder, encoder.start(0), replace(now, view=opaque)).state.past
-    assert past is not None
     assert past.view.opacity is None
     with pytest.raises(InvalidInput, match="opacity: was dropped"):
         _ = past.view.confidence
@@ -205,14 +183,12 @@ def test_a_kept_frame_drops_the_opacity_that_nobody_asks_for(
         ({"crf": 60.0}, "crf: 60"),
     ],
 )
-def test_choices_that_cannot_be_are_refused(change: dict[str, object], named: str) -> None:
+def test_choices_that_cannot_be_are_refused(change, named):
     with pytest.raises(InvalidInput, match=named):
-        FrameChoice(**change)  # type: ignore[arg-type]
+        FrameChoice(**change)
 
 
-def test_the_quality_of_a_frame_is_the_callers(
-    encoder: DeltaEncoder, moments: list[Moment]
-) -> None:
+def test_the_quality_of_a_frame_is_the_callers(encoder, moments):
     sizes = [
         len(send(encoder, encoder.start(0), moments[0], FrameChoice(crf=crf)).packet.payload)
         for crf in (18, 23, 30, 40)

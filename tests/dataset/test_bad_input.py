@@ -279,9 +279,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("format_name", "fault", "named"), CASES)
-def test_a_fault_is_named_in_one_line(
-    golden: Any, format_name: str, fault: Fault, named: str, tmp_path: Path
-) -> None:
+def test_a_fault_is_named_in_one_line(golden, format_name, fault, named, tmp_path):
     folder = golden.write(format_name, tmp_path / "d")
     fault(folder)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -294,9 +292,7 @@ def test_a_fault_is_named_in_one_line(
     assert after == before, "nothing is written"
 
 
-def test_a_picture_outside_the_trajectory_is_left_out_when_that_is_declared(
-    golden: Any, tmp_path: Path
-) -> None:
+def test_a_picture_outside_the_trajectory_is_left_out_when_that_is_declared(golden, tmp_path):
     folder = golden.write("video", tmp_path / "d")
     edit_text("camera.toml", "100.0", "99.95\noutside = 'drop'")(folder)
     dataset = read_dataset(folder)
@@ -304,9 +300,7 @@ def test_a_picture_outside_the_trajectory_is_left_out_when_that_is_declared(
     assert dataset.sorted_out == 1
 
 
-def test_a_transforms_file_beyond_the_budget_is_refused_unread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_transforms_file_beyond_the_budget_is_refused_unread(tmp_path, monkeypatch):
     (tmp_path / "transforms.json").write_text('{"frames": []}')
     monkeypatch.setattr("rfcore.dataset.keys.MAX_JSON_BYTES", 13)
     monkeypatch.setattr("rfcore.dataset.keys.read_file", None)  # none is to get so far

@@ -24,7 +24,7 @@ PARAMETERS = {
 
 
 @pytest.mark.parametrize("model", PARAMETERS)
-def test_a_camera_projects_as_colmaps_does(model: str) -> None:
+def test_a_camera_projects_as_colmaps_does(model):
     ours = camera_of("x", model, SIZE_PX, PARAMETERS[model])
     theirs = pycolmap.Camera(
         model=model, width=SIZE_PX[0], height=SIZE_PX[1], params=PARAMETERS[model]
@@ -40,7 +40,7 @@ def projected(camera: SourceCamera, rays: np.ndarray) -> np.ndarray:
     return sensor * (k.fx_px, k.fy_px) + (k.cx_px, k.cy_px)
 
 
-def test_both_encodings_say_the_same_of_a_model_colmap_wrote(tmp_path: Path) -> None:
+def test_both_encodings_say_the_same_of_a_model_colmap_wrote(tmp_path):
     model = synthetic(tmp_path)
     binary, text = read_binary_model(tmp_path / "bin"), read_text_model(tmp_path / "txt")
     assert binary.cameras == text.cameras
@@ -51,8 +51,6 @@ def test_both_encodings_say_the_same_of_a_model_colmap_wrote(tmp_path: Path) -> 
         theirs = model.find_image_with_name(a.name).cam_from_world().matrix()
         np.testing.assert_allclose(a.cam_from_world.rotation_matrix(), theirs[:, :3], atol=1e-12)
         np.testing.assert_allclose(a.cam_from_world.translation_m, theirs[:, 3], atol=1e-12)
-    assert binary.points is not None
-    assert text.points is not None
     assert len(binary.points.xyz_m) == len(model.points3D) > 10
     np.testing.assert_array_equal(ordered(binary.points.xyz_m), ordered(text.points.xyz_m))
 
@@ -78,7 +76,7 @@ def ordered(points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("cut", [4, 20, 60, 100])
-def test_a_binary_file_cut_short_is_refused(golden: Any, tmp_path: Path, cut: int) -> None:
+def test_a_binary_file_cut_short_is_refused(golden, tmp_path, cut):
     folder = golden.write("colmap_binary", tmp_path)
     file = folder / "sparse" / "0" / "images.bin"
     file.write_bytes(file.read_bytes()[:cut])
@@ -86,7 +84,7 @@ def test_a_binary_file_cut_short_is_refused(golden: Any, tmp_path: Path, cut: in
         read_dataset(folder)
 
 
-def test_a_count_that_the_file_cannot_hold_is_refused(golden: Any, tmp_path: Path) -> None:
+def test_a_count_that_the_file_cannot_hold_is_refused(golden, tmp_path):
     folder = golden.write("colmap_binary", tmp_path)
     file = folder / "sparse" / "0" / "points3D.bin"
     file.write_bytes((2**60).to_bytes(8, "little") + file.read_bytes()[8:])

@@ -1,8 +1,6 @@
 """One scene in every format: the known point lands on the known pixel, forth and back."""
 
 import dataclasses
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ def format_name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def test_the_point_lands_on_its_pixel(golden: Any, format_name: str, tmp_path: Path) -> None:
+def test_the_point_lands_on_its_pixel(golden, format_name, tmp_path):
     dataset = read_dataset(golden.write(format_name, tmp_path / "d"))
     assert dataset.tile_origin == TileOrigin()
     for picture, expected in zip(dataset.pictures, golden.pixels(), strict=True):
@@ -28,7 +26,7 @@ def test_the_point_lands_on_its_pixel(golden: Any, format_name: str, tmp_path: P
         assert (u_px, v_px) == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_pixel_of_the_point_is_white(golden: Any, format_name: str, tmp_path: Path) -> None:
+def test_the_pixel_of_the_point_is_white(golden, format_name, tmp_path):
     """The file of a picture belongs to its pose, and nothing is flipped or shifted."""
     for picture in read_dataset(golden.write(format_name, tmp_path / "d")).pictures:
         u_px, v_px, _ = picture.camera.project(golden.point)
@@ -37,11 +35,7 @@ def test_the_pixel_of_the_point_is_white(golden: Any, format_name: str, tmp_path
         assert np.median(rgb) == pytest.approx(90, abs=1)
 
 
-def test_a_scene_at_utm_magnitudes_keeps_its_pixels(
-    golden_utm: Any,
-    format_name: str,
-    tmp_path: Path,
-) -> None:
+def test_a_scene_at_utm_magnitudes_keeps_its_pixels(golden_utm, format_name, tmp_path):
     """float64 resolves 1e-9 m there; cam_from_world of COLMAP multiplies that by its turn."""
     dataset = read_dataset(golden_utm.write(format_name, tmp_path / "d"))
     origin = dataset.tile_origin
@@ -54,7 +48,7 @@ def test_a_scene_at_utm_magnitudes_keeps_its_pixels(
 
 
 @pytest.mark.parametrize("timed", TIMED)
-def test_times_give_the_rate(golden: Any, timed: str, tmp_path: Path) -> None:
+def test_times_give_the_rate(golden, timed, tmp_path):
     dataset = read_dataset(golden.write(timed, tmp_path / "d"))
     times_ns = [picture.time_ns for picture in dataset.pictures]
     assert times_ns == [100_000_000_000, 100_100_000_000, 100_200_000_000]
@@ -62,21 +56,20 @@ def test_times_give_the_rate(golden: Any, timed: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("colmap", ["colmap_text", "colmap_binary"])
-def test_a_model_brings_its_points(golden: Any, colmap: str, tmp_path: Path) -> None:
+def test_a_model_brings_its_points(golden, colmap, tmp_path):
     points = read_dataset(golden.write(colmap, tmp_path / "d")).points
-    assert points is not None
     np.testing.assert_array_equal(points.xyz_m, [golden.point])
     np.testing.assert_array_equal(points.rgb, [[255, 128, 0]])
 
 
-def test_a_video_is_read_in_any_order(golden: Any, tmp_path: Path) -> None:
+def test_a_video_is_read_in_any_order(golden, tmp_path):
     pictures = read_dataset(golden.write("video", tmp_path / "d")).pictures
     ahead = [picture.read() for picture in pictures]
     for i in (2, 0, 1, 1):
         np.testing.assert_array_equal(pictures[i].read(), ahead[i])
 
 
-def test_a_folder_with_two_datasets_asks_which(golden: Any, tmp_path: Path) -> None:
+def test_a_folder_with_two_datasets_asks_which(golden, tmp_path):
     folder = golden.write("colmap_text", tmp_path)
     golden.write("inria", tmp_path)
     with pytest.raises(DatasetError, match=r"several datasets.*cameras\.json.*images\.txt"):
@@ -85,6 +78,6 @@ def test_a_folder_with_two_datasets_asks_which(golden: Any, tmp_path: Path) -> N
     assert len(read_dataset(folder / "sparse" / "0").pictures) == 3
 
 
-def test_a_folder_without_a_dataset_says_what_is_expected(tmp_path: Path) -> None:
+def test_a_folder_without_a_dataset_says_what_is_expected(tmp_path):
     with pytest.raises(DatasetError, match=r"transforms\.json, .*camera\.toml"):
         read_dataset(tmp_path)

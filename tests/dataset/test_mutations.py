@@ -1,7 +1,6 @@
 """A damaged description is read or refused as ``DatasetError``: nothing else comes out."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,9 +28,7 @@ MUTATIONS = 60
 
 
 @pytest.mark.parametrize(("format_name", "name"), [*DESCRIPTIONS.items(), *OTHERS.items()])
-def test_a_mutated_description_is_read_or_refused(
-    golden: Any, format_name: str, name: str, tmp_path: Path
-) -> None:
+def test_a_mutated_description_is_read_or_refused(golden, format_name, name, tmp_path):
     folder = golden.write(format_name, tmp_path / "d")
     whole = (folder / name).read_bytes()
     rng = np.random.default_rng(len(whole))
@@ -62,7 +59,7 @@ def mutated(content: bytes, rng: np.random.Generator) -> bytes:
     return content[:at] + b"9" * 400 + content[at:]
 
 
-def test_a_video_of_an_unknown_codec_is_refused(golden: Any, tmp_path: Path) -> None:
+def test_a_video_of_an_unknown_codec_is_refused(golden, tmp_path):
     folder = golden.write("video", tmp_path / "d")
     content = (folder / "drive.mp4").read_bytes()
     (folder / "drive.mp4").write_bytes(content.replace(b"avc1\0\0", b"zzz9\0\0"))
@@ -70,7 +67,7 @@ def test_a_video_of_an_unknown_codec_is_refused(golden: Any, tmp_path: Path) -> 
         read_dataset(folder)
 
 
-def test_a_whole_number_beyond_every_float_is_refused(golden: Any, tmp_path: Path) -> None:
+def test_a_whole_number_beyond_every_float_is_refused(golden, tmp_path):
     folder = golden.write("transforms", tmp_path / "d")
     text = (folder / "transforms.json").read_text()
     (folder / "transforms.json").write_text(text.replace('"w": 64', '"w": 1' + "0" * 400))

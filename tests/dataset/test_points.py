@@ -1,7 +1,5 @@
 """Points of a PLY file that are damaged name the file."""
 
-from pathlib import Path
-
 import pytest
 
 from rfcore.dataset.source import read_points
@@ -24,7 +22,7 @@ HEADER = (
         (HEADER.format(n=1, colour="uchar"), b"\0\0\xc0\x7f" + bytes(11), "not finite"),
     ],
 )
-def test_damaged_points_are_refused(tmp_path: Path, header: str, rows: bytes, named: str) -> None:
+def test_damaged_points_are_refused(tmp_path, header, rows, named):
     file = tmp_path / "points.ply"
     file.write_bytes(header.encode() + rows)
     with pytest.raises(DatasetError, match=rf"points\.ply.*{named}"):

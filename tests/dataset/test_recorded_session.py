@@ -33,13 +33,13 @@ def write_part(folder: Path, *pictures: RecordedPicture) -> Path:
     return file
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_what_is_written_is_read(tmp_path):
     pictures = (picture(0, 10**18 + 1), picture(1, 10**18 + 10**8))
     part = read_recorded_part(write_part(tmp_path / "p", *pictures))
     assert (part.camera, part.pictures) == (CAMERA, pictures)
 
 
-def test_a_folder_of_parts_is_one_dataset_in_order_of_time(tmp_path: Path) -> None:
+def test_a_folder_of_parts_is_one_dataset_in_order_of_time(tmp_path):
     write_part(tmp_path / "v/front/1-a", picture(0, 100), picture(1, 300))
     write_part(tmp_path / "v/front/2-b", picture(2, 200))
     dataset = read_dataset(tmp_path)
@@ -48,7 +48,7 @@ def test_a_folder_of_parts_is_one_dataset_in_order_of_time(tmp_path: Path) -> No
     assert len({p.name for p in dataset.pictures}) == 3
 
 
-def test_a_line_that_is_being_written_is_left_out(tmp_path: Path) -> None:
+def test_a_line_that_is_being_written_is_left_out(tmp_path):
     file = write_part(tmp_path / "p", picture(0, 1))
     with file.open("a") as unfinished:
         unfinished.write('{"file": "0000')
@@ -65,7 +65,7 @@ def test_a_line_that_is_being_written_is_left_out(tmp_path: Path) -> None:
         ("translation_m", [0, 1], "line 2: key 'translation_m'"),
     ],
 )
-def test_a_wrong_line_is_named(tmp_path: Path, key: str, value: object, problem: str) -> None:
+def test_a_wrong_line_is_named(tmp_path, key, value, problem):
     file = write_part(tmp_path / "p", picture(0, 1))
     head, line = file.read_text().splitlines()
     file.write_text(f"{head}\n{json.dumps(json.loads(line) | {key: value})}\n")
@@ -83,13 +83,13 @@ def test_a_wrong_line_is_named(tmp_path: Path, key: str, value: object, problem:
         (CAMERA.line().replace('"width_px": 8', '"width_px": 0'), "width_px"),
     ],
 )
-def test_a_wrong_head_is_named(tmp_path: Path, head: str, problem: str) -> None:
+def test_a_wrong_head_is_named(tmp_path, head, problem):
     (tmp_path / "recording.jsonl").write_text(head)
     with pytest.raises(DatasetError, match=problem):
         read_dataset(tmp_path)
 
 
-def test_a_picture_of_another_size_than_its_camera_is_refused(tmp_path: Path) -> None:
+def test_a_picture_of_another_size_than_its_camera_is_refused(tmp_path):
     file = write_part(tmp_path / "p", picture(0, 1))
     write_png(tmp_path / "p/000000.png", np.zeros((6, 7, 3), np.uint8))
     with pytest.raises(DatasetError, match="7x6"):

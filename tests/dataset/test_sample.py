@@ -14,11 +14,11 @@ SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 pytestmark = pytest.mark.sample
 
 
-def test_every_file_is_as_it_was_listed() -> None:
+def test_every_file_is_as_it_was_listed():
     verify_manifest(SAMPLE)
 
 
-def test_the_two_drives_take_the_same_path() -> None:
+def test_the_two_drives_take_the_same_path():
     empty, vehicles = (
         read_dataset(SAMPLE / f"transforms_drive_{name}.json").pictures
         for name in ("empty", "vehicles")
@@ -27,7 +27,7 @@ def test_the_two_drives_take_the_same_path() -> None:
     assert (empty[0].read() != vehicles[0].read()).any()
 
 
-def test_the_points_have_the_colour_of_the_pixels_they_land_on() -> None:
+def test_the_points_have_the_colour_of_the_pixels_they_land_on():
     """The nearest point of each 8x8 px; with the pose of another view they are far off."""
     train = read_dataset(SAMPLE / "transforms_train.json")
     assert train.points is not None

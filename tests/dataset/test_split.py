@@ -46,9 +46,7 @@ def record(folder: Path, places_m: list[float], points: bool = True) -> Path:
     st.floats(20, 300),
     st.floats(0, 1),
 )
-def test_each_picture_is_in_the_tile_it_is_on_and_in_those_it_is_near(
-    places: list[tuple[float, float]], length_m: float, share: float
-) -> None:
+def test_each_picture_is_in_the_tile_it_is_on_and_in_those_it_is_near(places, length_m, share):
     ground_m = np.array(places)
     overlap_m = share * length_m
     tiles = tiles_of(ground_m, SplitSettings(length_m, overlap_m, fewest=1))
@@ -62,7 +60,7 @@ def test_each_picture_is_in_the_tile_it_is_on_and_in_those_it_is_near(
         assert set(np.flatnonzero(outside_m < overlap_m / 2 - 1e-6)) <= set(tile.pictures)
 
 
-def test_tiles_side_by_side_share_the_overlap_and_name_each_other() -> None:
+def test_tiles_side_by_side_share_the_overlap_and_name_each_other():
     ground_m = np.column_stack([np.arange(0, 91, 1.0), np.zeros(91)])
     tiles = tiles_of(ground_m, SplitSettings(30, 10))
     assert [tile.name for tile in tiles] == ["tile-0-0", "tile-1-0", "tile-2-0"]
@@ -82,7 +80,7 @@ def test_tiles_side_by_side_share_the_overlap_and_name_each_other() -> None:
     assert {tile.margin_m for tile in tiles} == {5.0}
 
 
-def test_ground_without_pictures_is_no_tile() -> None:
+def test_ground_without_pictures_is_no_tile():
     ground_m = np.array([[0.0, 0.0], [1.0, 0.0], [100.0, 0.0]])
     tiles = tiles_of(ground_m, SplitSettings(10, 0, fewest=1))
     assert [tile.name for tile in tiles] == ["tile-0-0", "tile-9-0"]
@@ -100,14 +98,12 @@ def test_ground_without_pictures_is_no_tile() -> None:
         ((10, 1, 1, -1), "points: -1 m must be at least 0"),
     ],
 )
-def test_settings_outside_their_limits_are_refused(
-    settings: tuple[float, ...], message: str
-) -> None:
+def test_settings_outside_their_limits_are_refused(settings, message):
     with pytest.raises(InvalidInput, match=message):
-        SplitSettings(*settings)  # type: ignore[arg-type]
+        SplitSettings(*settings)
 
 
-def test_too_many_tiles_and_tiles_of_too_few_pictures_are_refused() -> None:
+def test_too_many_tiles_and_tiles_of_too_few_pictures_are_refused():
     ground_m = np.array([[0.0, 0.0], [5000.0, 5000.0]])
     with pytest.raises(InvalidInput, match=r"10 m makes 250000 tiles .* the limit is 1000"):
         tiles_of(ground_m, SplitSettings(10, 1))
@@ -115,7 +111,7 @@ def test_too_many_tiles_and_tiles_of_too_few_pictures_are_refused() -> None:
         tiles_of(ground_m, SplitSettings(2500, 1))
 
 
-def test_readers_take_every_tile_in_the_recordings_own_world(tmp_path: Path) -> None:
+def test_readers_take_every_tile_in_the_recordings_own_world(tmp_path):
     drive = record(tmp_path / "drive", [float(x) for x in range(0, 61, 2)])
     tiles = split_dataset(drive, tmp_path / "split", SplitSettings(30, 8, points_m=4.0))
     assert read_tiles(tmp_path / "split") == tiles
@@ -124,7 +120,6 @@ def test_readers_take_every_tile_in_the_recordings_own_world(tmp_path: Path) -> 
     for tile, entry in zip(tiles, listed, strict=True):
         dataset = read_dataset(tmp_path / "split" / tile.name)
         assert list(astuple(dataset.tile_origin)) == entry["tile_origin_m"] != [0, 0, 0]
-        assert dataset.points is not None
         for index, picture in zip(tile.pictures, dataset.pictures, strict=True):
             was = whole.pictures[index]
             place, before = (
@@ -140,9 +135,7 @@ def test_readers_take_every_tile_in_the_recordings_own_world(tmp_path: Path) -> 
         assert east_m - 2 <= x_m.max() <= east_m + 4
 
 
-def test_a_recording_without_points_is_split_and_a_folder_is_not_overwritten(
-    tmp_path: Path,
-) -> None:
+def test_a_recording_without_points_is_split_and_a_folder_is_not_overwritten(tmp_path):
     drive = record(tmp_path / "drive", [float(x) for x in range(20)], points=False)
     settings = SplitSettings(100, 0)
     (tile,) = split_dataset(drive, tmp_path / "split", settings)
@@ -156,12 +149,12 @@ def test_a_recording_without_points_is_split_and_a_folder_is_not_overwritten(
     "content",
     ["{}", "[", '{"tiles": []}', '{"tiles": [{"id": "a"}]}', '{"tiles": [{"id": "../a", %s}]}'],
 )
-def test_a_list_of_tiles_that_is_damaged_is_refused(content: str, tmp_path: Path) -> None:
+def test_a_list_of_tiles_that_is_damaged_is_refused(content, tmp_path):
     rest = '"area_m": [0, 0, 1, 1], "margin_m": 0, "pictures": [], "neighbours": []'
     (tmp_path / "tiles.json").write_text(content % rest if "%s" in content else content)
     with pytest.raises(DatasetError, match=r"tiles\.json"):
         read_tiles(tmp_path)
 
 
-def test_a_folder_without_a_list_has_no_tiles(tmp_path: Path) -> None:
+def test_a_folder_without_a_list_has_no_tiles(tmp_path):
     assert read_tiles(tmp_path) is None

@@ -1,7 +1,6 @@
 """Trajectories are read exactly, interpolated along great circles, and never extrapolated."""
 
 import math
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +11,7 @@ from rfcore.errors import DatasetError
 LIMIT_NS = 1_000_000_000
 
 
-def test_the_ends_and_the_middle_are_what_they_should_be(tmp_path: Path) -> None:
+def test_the_ends_and_the_middle_are_what_they_should_be(tmp_path):
     file = tmp_path / "t.txt"
     half = math.sqrt(0.5)
     file.write_text(f"# t x y z qx qy qz qw\n10 0 0 0 0 0 0 1\n\n10.5 1 2 4 0 0 {half} {half}\n")
@@ -29,14 +28,14 @@ def test_the_ends_and_the_middle_are_what_they_should_be(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("time", [9_999_999_999, 10_500_000_001])
-def test_a_time_outside_is_refused(tmp_path: Path, time: int) -> None:
+def test_a_time_outside_is_refused(tmp_path, time):
     file = tmp_path / "t.txt"
     file.write_text("10 0 0 0 0 0 0 1\n10.5 0 0 0 0 0 0 1\n")
     with pytest.raises(DatasetError, match=r"^x: time .*outside .*t\.txt.*time_offset_s.*drop"):
         read_trajectory(file).pose_at("x", time, LIMIT_NS)
 
 
-def test_a_gap_is_not_bridged(tmp_path: Path) -> None:
+def test_a_gap_is_not_bridged(tmp_path):
     file = tmp_path / "t.txt"
     file.write_text("10 0 0 0 0 0 0 1\n12 0 0 0 0 0 0 1\n")
     with pytest.raises(DatasetError, match=r"2\.000 s apart, over max_gap_s = 1"):
@@ -44,12 +43,12 @@ def test_a_gap_is_not_bridged(tmp_path: Path) -> None:
     assert read_trajectory(file).pose_at("x", 12_000_000_000, LIMIT_NS) == Pose.identity()
 
 
-def test_times_are_exact_to_the_nanosecond() -> None:
+def test_times_are_exact_to_the_nanosecond():
     """As a float, 1305031102.175304123 s would be off by up to 120 ns."""
     assert time_ns("x", "1305031102.175304123") == 1_305_031_102_175_304_123
 
 
-def test_csv_columns_come_in_any_order(tmp_path: Path) -> None:
+def test_csv_columns_come_in_any_order(tmp_path):
     file = tmp_path / "t.csv"
     file.write_text("qw, qx, qy, qz, note, x_m, y_m, z_m, time_ns\n1,0,0,0,a,4,5,6,123456789\n")
     trajectory = read_trajectory(file)
@@ -73,7 +72,7 @@ def test_csv_columns_come_in_any_order(tmp_path: Path) -> None:
         ("t.csv", "time_s,x_m,y_m,z_m,qw,qx,qy,qz\n1,2,3,4,1,0,0,b\n", "line 2: .*'b'"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, name: str, text: str | bytes, named: str) -> None:
+def test_what_is_wrong_is_named(tmp_path, name, text, named):
     (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(DatasetError, match=rf"{name}: {named}"):
         read_trajectory(tmp_path / name)

@@ -14,12 +14,9 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field.ply_table import write_vertices
 
 Content = dict[str, Any]
-Write = Callable[..., Path]
 
 
-def test_a_rotated_camera_keeps_its_place_and_turns_its_axes(
-    write: Write, content: Content
-) -> None:
+def test_a_rotated_camera_keeps_its_place_and_turns_its_axes(write, content):
     """Yaw by 90 degrees about z-up: a camera at (5, 6, 7) that looks along world +x."""
     content["frames"][0]["transform_matrix"] = [
         [0, 0, -1, 5],
@@ -34,38 +31,37 @@ def test_a_rotated_camera_keeps_its_place_and_turns_its_axes(
     assert camera.project((15, 6, 8)) == pytest.approx((4, 1.8, 10)), "world z is up"
 
 
-def test_pixels_times_rate_and_points_come_with_it(write: Write, content: Content) -> None:
+def test_pixels_times_rate_and_points_come_with_it(write, content):
     dataset = read_dataset(write(content))
     assert [picture.name for picture in dataset.pictures] == ["a.png", "b.png"]
     assert [picture.time_ns for picture in dataset.pictures] == [0, 100_000_000]
     assert dataset.rate_hz == pytest.approx(10.0)
     assert (dataset.pictures[1].read() == 20).all()
-    assert dataset.points is not None
     np.testing.assert_array_equal(dataset.points.xyz_m, [[0, 0, 1], [4, 5, 6], [0.5, 0, -1]])
     np.testing.assert_array_equal(dataset.points.rgb, [[1, 2, 3], [7, 8, 9], [255, 0, 0]])
 
 
-def test_a_directory_stands_for_its_transforms_file(write: Write, content: Content) -> None:
+def test_a_directory_stands_for_its_transforms_file(write, content):
     assert len(read_dataset(write(content).parent).pictures) == 2
     named = write(content, "transforms_drive.json")
     assert len(read_dataset(named.parent).pictures) == 2, "transforms.json goes first"
 
 
-def test_a_directory_with_several_drives_asks_which(write: Write, content: Content) -> None:
+def test_a_directory_with_several_drives_asks_which(write, content):
     write(content, "transforms_one.json")
     directory = write(content, "transforms_two.json").parent
     with pytest.raises(DatasetError, match=r"transforms_one\.json, transforms_two\.json"):
         read_dataset(directory)
 
 
-def test_a_frame_may_override_the_intrinsics(write: Write, content: Content) -> None:
+def test_a_frame_may_override_the_intrinsics(write, content):
     content["frames"][1] |= {"fl_x": 20.0, "cx": 1.5}
     first, second = (p.camera.intrinsics for p in read_dataset(write(content)).pictures)
     assert (first.fx_px, first.cx_px) == (10.0, 4.0)
     assert (second.fx_px, second.cx_px, second.fy_px) == (20.0, 1.5, 12.0)
 
 
-def test_a_field_of_view_stands_for_the_focal_length(write: Write, content: Content) -> None:
+def test_a_field_of_view_stands_for_the_focal_length(write, content):
     for key in ("fl_x", "fl_y", "cx", "cy"):
         del content[key]
     content["camera_angle_x"] = math.pi / 2
@@ -74,19 +70,18 @@ def test_a_field_of_view_stands_for_the_focal_length(write: Write, content: Cont
     assert k.fy_px == k.fx_px
 
 
-def test_pictures_without_times_have_no_rate(write: Write, content: Content) -> None:
+def test_pictures_without_times_have_no_rate(write, content):
     del content["frames"][0]["time"]
     assert read_dataset(write(content)).rate_hz is None
 
 
-def test_the_tile_origin_is_taken_off_poses_and_points(write: Write, content: Content) -> None:
+def test_the_tile_origin_is_taken_off_poses_and_points(write, content):
     content["frames"][0]["transform_matrix"][0][3] = 691_608.125
     content["frames"][1]["transform_matrix"][0][3] = 691_609.125
     origin = TileOrigin(east_m=691_608.0)
     dataset = read_dataset(write(content), tile_origin=origin)
     assert dataset.tile_origin == origin
     assert dataset.pictures[0].camera.world_from_cam.translation_m == (0.125, 0, 0)
-    assert dataset.points is not None
     assert dataset.points.xyz_m[1, 0] == np.float32(4.0 - 691_608.0)
 
 
@@ -137,9 +132,7 @@ FAR = [[1, 0, 0, 7e5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (top_change("ply_file_path", "../points.ply"), "points.ply' leaves the dataset"),
     ],
 )
-def test_what_is_wrong_is_named(
-    write: Write, content: Content, change: Callable[[Content], None], named: str
-) -> None:
+def test_what_is_wrong_is_named(write, content, change, named):
     change(content)
     with pytest.raises(DatasetError, match=named) as caught:
         read_dataset(write(content))
@@ -147,25 +140,25 @@ def test_what_is_wrong_is_named(
     assert "\n" not in str(caught.value)
 
 
-def test_a_distortion_of_zero_is_no_distortion(write: Write, content: Content) -> None:
+def test_a_distortion_of_zero_is_no_distortion(write, content):
     content |= {"k1": 0.0, "k2": 0, "p1": 0.0}
     assert len(read_dataset(write(content)).pictures) == 2
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3"])
-def test_a_file_that_is_no_transforms_file_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_no_transforms_file_is_refused(tmp_path, text):
     file = tmp_path / "transforms.json"
     file.write_text(text)
     with pytest.raises(DatasetError, match=r"transforms.json"):
         read_dataset(file)
 
 
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="cannot be read"):
         read_dataset(tmp_path / "transforms_x.json")
 
 
-def test_a_blurred_picture_that_was_sorted_out_is_left_out(write: Write, content: Content) -> None:
+def test_a_blurred_picture_that_was_sorted_out_is_left_out(write, content):
     """instant-ngp's colmap2nerf writes ``sharpness`` so that blurred pictures can be deleted."""
     content["frames"][0]["file_path"] = "gone.png"
     file = write(content)
@@ -177,7 +170,7 @@ def test_a_blurred_picture_that_was_sorted_out_is_left_out(write: Write, content
     assert dataset.sorted_out == 1
 
 
-def test_what_was_applied_to_the_world_is_undone(write: Write, content: Content) -> None:
+def test_what_was_applied_to_the_world_is_undone(write, content):
     """nerfstudio turns COLMAP's world (x, y, z) to (x, z, -y); here it is also scaled by 2."""
     plain = read_dataset(write(content))
     turn = np.array([[1, 0, 0, 0.5], [0, 0, 1, -1], [0, -1, 0, 2], [0, 0, 0, 1]], float)
@@ -187,7 +180,6 @@ def test_what_was_applied_to_the_world_is_undone(write: Write, content: Content)
         matrix[:3, 3] *= 2.0
         frame["transform_matrix"] = matrix.tolist()
     file = write(content)
-    assert plain.points is not None
     turned = plain.points.xyz_m @ turn[:3, :3].T.astype(np.float32) + turn[:3, 3]
     write_points(file.parent / "points.ply", 2 * turned, plain.points.rgb)
     undone = read_dataset(file)
@@ -195,7 +187,6 @@ def test_what_was_applied_to_the_world_is_undone(write: Write, content: Content)
         assert picture.camera.project((1, 1, -4)) == pytest.approx(
             expected.camera.project((1, 1, -4))
         )
-    assert undone.points is not None
     np.testing.assert_allclose(undone.points.xyz_m, plain.points.xyz_m, atol=1e-6)
 
 
@@ -205,7 +196,7 @@ def write_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
     write_vertices(path, np.array(rows, columns))
 
 
-def test_a_lens_is_taken_out_only_when_that_is_chosen(write: Write, content: Content) -> None:
+def test_a_lens_is_taken_out_only_when_that_is_chosen(write, content):
     content["frames"][1]["k1"] = 0.05
     file = write(content)
     with pytest.raises(DatasetError, match=r"frames\[1\].*undistorted"):
@@ -218,7 +209,7 @@ def test_a_lens_is_taken_out_only_when_that_is_chosen(write: Write, content: Con
     assert (dataset.pictures[1].read() == 20).all()
 
 
-def test_a_smaller_size_scales_pictures_and_cameras_alike(write: Write, content: Content) -> None:
+def test_a_smaller_size_scales_pictures_and_cameras_alike(write, content):
     picture = read_dataset(write(content), size_px=(4, 2)).pictures[0]
     assert picture.read().shape == (2, 4, 3)
     assert picture.camera.project((1, 1, -4)) == pytest.approx((3.25, 0, 4))

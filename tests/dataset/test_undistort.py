@@ -31,7 +31,7 @@ def pattern(xy: np.ndarray) -> Rgb:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_every_pixel_shows_its_own_direction(lens: Lens) -> None:
+def test_every_pixel_shows_its_own_direction(lens):
     """Rounding twice is one level; bilinear is off by 120 * 9^2 / 250^2 / 4 < 0.1 of one."""
     pinhole = pinhole_of(K, lens)
     u, v = np.meshgrid(np.arange(K.width_px) + 0.5, np.arange(K.height_px) + 0.5)
@@ -44,7 +44,7 @@ def test_every_pixel_shows_its_own_direction(lens: Lens) -> None:
     assert error.mean() < 0.5
 
 
-def test_the_pixels_are_opencvs() -> None:
+def test_the_pixels_are_opencvs():
     """OpenCV counts pixel centres from 0; its weights have 5 bits, which is 120 / 32 / 8 levels."""
     lens = BrownLens(k1=0.06, k2=-0.08, p1=-1e-3, p2=1.5e-4)
     pinhole, rgb = pinhole_of(K, lens), seen_through(lens)
@@ -61,7 +61,7 @@ def test_the_pixels_are_opencvs() -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_the_view_is_the_widest_without_blank_pixels(lens: Lens) -> None:
+def test_the_view_is_the_widest_without_blank_pixels(lens):
     pinhole = pinhole_of(K, lens)
     assert (pinhole.width_px, pinhole.height_px) == (K.width_px, K.height_px)
     assert (pinhole.cx_px, pinhole.cy_px) == (K.cx_px, K.cy_px)
@@ -87,11 +87,11 @@ def outermost(pinhole: Intrinsics, lens: Lens) -> float:
     return float(beyond.max())
 
 
-def test_a_wide_fisheye_keeps_half_the_resolution_of_its_middle() -> None:
+def test_a_wide_fisheye_keeps_half_the_resolution_of_its_middle():
     wide = Intrinsics(100, 100, 30.0, 30.0, 50.0, 50.0)
     assert pinhole_of(wide, FisheyeLens()).fx_px == 15.0
 
 
-def test_a_lens_that_turns_back_at_once_is_refused() -> None:
+def test_a_lens_that_turns_back_at_once_is_refused():
     with pytest.raises(InvalidInput, match="blank pixels"):
         pinhole_of(K, BrownLens(k1=-1e4))

@@ -13,7 +13,7 @@ from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput
 from rfcore.files import whole_folder
 from rfcore.image import write_png
-from rfcore.lens import BrownLens, FisheyeLens, Lens
+from rfcore.lens import BrownLens, FisheyeLens
 
 K = Intrinsics(8, 6, 7.5, 7.25, 4.125, 2.875)
 FAR = Pose((691_608.125, 5_334_760.0625, 519.5), (0.5, -0.5, 0.5, -0.5))
@@ -33,7 +33,7 @@ def written(folder: Path, cameras: list[SourceCamera]) -> list[WrittenPicture]:
 
 
 @pytest.mark.parametrize("lens", [None, BrownLens(0.1, -0.2, 1e-3, 2e-3, 0.05), FisheyeLens(0.1)])
-def test_poses_lenses_and_points_come_back_exactly(lens: Lens | None, tmp_path: Path) -> None:
+def test_poses_lenses_and_points_come_back_exactly(lens, tmp_path):
     pictures = written(tmp_path, [SourceCamera(K, lens)] * 2)
     source = read_source(tmp_path)
     assert [p.time_ns for p in source.pictures] == [0, 100_000_000]
@@ -44,18 +44,17 @@ def test_poses_lenses_and_points_come_back_exactly(lens: Lens | None, tmp_path: 
             assert found.world_from_cam.apply(axis) == pytest.approx(
                 given.world_from_cam.apply(axis), abs=1e-9
             )
-    assert source.points is not None
     np.testing.assert_array_equal(source.points.xyz_m, POINTS.xyz_m)
     np.testing.assert_array_equal(source.points.rgb, POINTS.rgb)
 
 
-def test_pictures_of_different_cameras_keep_their_own(tmp_path: Path) -> None:
+def test_pictures_of_different_cameras_keep_their_own(tmp_path):
     cameras = [SourceCamera(K), SourceCamera(K, BrownLens(k1=0.1))]
     written(tmp_path, cameras)
     assert [p.camera for p in read_source(tmp_path).pictures] == cameras
 
 
-def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     with pytest.raises(RuntimeError, match="half way"):
         fill_half(tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

@@ -13,6 +13,7 @@ from rfcore.dataset.write import WrittenPicture, transforms_of, write_points
 from rfcore.image import write_png
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
+from tests.clouds import upright
 
 INTRINSICS = Intrinsics(96, 64, 60.0, 60.0, 48.0, 32.0)
 DRIVE_FRAMES = 4
@@ -20,17 +21,8 @@ DRIVE_FRAMES = 4
 
 def tiny_street() -> Gaussians:
     rng = np.random.default_rng(3)
-    n = 400
-    means = rng.uniform([-4, -2, 4], [4, 2, 9], (n, 3)).astype(np.float32)
-    sh = np.zeros((n, 1, 3), np.float32)
-    sh[:, 0] = rng.uniform(-1.5, 1.5, (n, 3))
-    return Gaussians(
-        means=means,
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        log_scales=np.full((n, 3), np.log(0.25), np.float32),
-        opacity_logits=np.full(n, 2.0, np.float32),
-        sh=sh,
-    )
+    means = rng.uniform([-4, -2, 4], [4, 2, 9], (400, 3))
+    return upright(means, rng.uniform(-1.5, 1.5, (400, 3)), 0.25).gaussians
 
 
 def write_views(folder: Path, name: str, xs_m: list[float], boxes: bool = False) -> None:

@@ -31,7 +31,7 @@ def demo(sample: Path, work: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_server_ends_up_with_the_vehicles_pictures(tiny_sample: Path, tmp_path: Path) -> None:
+def test_the_server_ends_up_with_the_vehicles_pictures(tiny_sample, tmp_path):
     done = demo(tiny_sample, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     result = json.loads((tmp_path / "demo" / "result.json").read_text())
@@ -54,9 +54,7 @@ def in_a_browser(said: str) -> None:
     assert len(read_dataset(verb.drive).pictures) == 4
 
 
-def test_a_damaged_sample_is_one_clear_error_and_nothing_is_written(
-    tiny_sample: Path, tmp_path: Path
-) -> None:
+def test_a_damaged_sample_is_one_clear_error_and_nothing_is_written(tiny_sample, tmp_path):
     victim = tiny_sample / "drive_empty" / "001.png"
     data = bytearray(victim.read_bytes())
     data[len(data) // 2] ^= 1
@@ -70,9 +68,7 @@ def test_a_damaged_sample_is_one_clear_error_and_nothing_is_written(
 
 
 @pytest.mark.parametrize("keeper", ["thesis.tex", "sub/notes.txt"])
-def test_a_folder_the_demo_did_not_make_is_not_emptied(
-    tiny_sample: Path, tmp_path: Path, keeper: str
-) -> None:
+def test_a_folder_the_demo_did_not_make_is_not_emptied(tiny_sample, tmp_path, keeper):
     precious = tmp_path / "demo" / keeper
     precious.parent.mkdir(parents=True)
     precious.write_text("mine")

@@ -27,16 +27,14 @@ def chosen(
     return choose_field(FieldChoice(sample, cache, config, anew), SILENT)
 
 
-def test_a_trained_field_is_found_again(tiny_sample: Path, tmp_path: Path) -> None:
+def test_a_trained_field_is_found_again(tiny_sample, tmp_path):
     path = chosen(tiny_sample, tmp_path / "c")
     written_ns = path.stat().st_mtime_ns
     again = chosen(tiny_sample, tmp_path / "c")
     assert (again, again.stat().st_mtime_ns) == (path, written_ns)
 
 
-def test_a_trained_field_is_small_has_levels_and_says_how_good_it_is(
-    tiny_sample: Path, tmp_path: Path
-) -> None:
+def test_a_trained_field_is_small_has_levels_and_says_how_good_it_is(tiny_sample, tmp_path):
     field = load_field(chosen(tiny_sample, tmp_path / "c"))
     assert isinstance(field, SplatField)
     assert "encoding" in field.archive().metadata
@@ -45,9 +43,7 @@ def test_a_trained_field_is_small_has_levels_and_says_how_good_it_is(
     assert field.metadata.held_out_ssim is not None
 
 
-def test_other_settings_or_another_sample_are_another_field(
-    tiny_sample: Path, tmp_path: Path
-) -> None:
+def test_other_settings_or_another_sample_are_another_field(tiny_sample, tmp_path):
     path = cache_path(tiny_sample, tmp_path, CONFIG)
     longer = SplatTrainingConfig(gaussians=100, iterations=4)
     assert cache_path(tiny_sample, tmp_path, longer) != path
@@ -58,7 +54,7 @@ def test_other_settings_or_another_sample_are_another_field(
     assert cache_path(tiny_sample, tmp_path, CONFIG) != path
 
 
-def test_a_damaged_field_says_how_to_make_it_anew(tiny_sample: Path, tmp_path: Path) -> None:
+def test_a_damaged_field_says_how_to_make_it_anew(tiny_sample, tmp_path):
     path = chosen(tiny_sample, tmp_path)
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
@@ -76,8 +72,8 @@ def shipped(tiny_sample: Path, tiny_gaussians: Gaussians) -> Path:
 
 
 def test_the_shipped_field_is_used_at_once_unless_the_user_asks_for_another(
-    shipped: Path, tiny_sample: Path, tmp_path: Path
-) -> None:
+    shipped, tiny_sample, tmp_path
+):
     assert chosen(tiny_sample, tmp_path / "c", SplatTrainingConfig(threads=2)) == shipped
     assert not (tmp_path / "c").exists()
     assert chosen(tiny_sample, tmp_path / "c", CONFIG) == cache_path(
@@ -86,18 +82,14 @@ def test_the_shipped_field_is_used_at_once_unless_the_user_asks_for_another(
 
 
 @pytest.mark.parametrize("victim", ["tiny.rff", "tiny.json"])
-def test_a_damaged_shipped_field_is_named_with_the_way_out(
-    shipped: Path, tiny_sample: Path, tmp_path: Path, victim: str
-) -> None:
+def test_a_damaged_shipped_field_is_named_with_the_way_out(shipped, tiny_sample, tmp_path, victim):
     path = shipped.parent / victim
     path.write_bytes(path.read_bytes()[:-1] + b"?")
     with pytest.raises(DatasetError, match=f"{victim}.*--train"):
         chosen(tiny_sample, tmp_path, SplatTrainingConfig())
 
 
-def test_a_shipped_field_of_another_sample_is_refused(
-    shipped: Path, tiny_sample: Path, tmp_path: Path
-) -> None:
+def test_a_shipped_field_of_another_sample_is_refused(shipped, tiny_sample, tmp_path):
     (tiny_sample / "more.txt").write_text("new")
     write_manifest(tiny_sample)
     with pytest.raises(DatasetError, match=r"made from another .* --train"):
@@ -108,18 +100,14 @@ def test_a_shipped_field_of_another_sample_is_refused(
         chosen(tiny_sample, tmp_path, SplatTrainingConfig())
 
 
-def test_a_field_too_large_to_ship_is_not_left_there(
-    tiny_sample: Path, tiny_gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_field_too_large_to_ship_is_not_left_there(tiny_sample, tiny_gaussians, monkeypatch):
     monkeypatch.setattr(sample_field, "MAX_BYTES", 1000)
     with pytest.raises(InvalidData, match="over the 1000"):
         write_sample_field(tiny_sample, SplatField(tiny_gaussians), BY_HAND, 0)
     assert not sample_field_path(tiny_sample).exists()
 
 
-def test_making_the_sample_field_writes_what_the_demo_takes(
-    tiny_sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_making_the_sample_field_writes_what_the_demo_takes(tiny_sample, tmp_path, monkeypatch):
     options = "--gaussians 100 --iterations 3 --limit 120 --sh-degree 1 --max-mb 0.02 --sky 50"
     monkeypatch.setattr("sys.argv", ["sample-field", str(tiny_sample), *options.split()])
     assert sample_field.main() == 0
@@ -135,9 +123,7 @@ def test_making_the_sample_field_writes_what_the_demo_takes(
     assert path.stat().st_size <= 20_000
 
 
-def test_a_sample_that_cannot_be_read_has_no_field_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sample_that_cannot_be_read_has_no_field_made(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["sample-field", str(tmp_path)])
     assert sample_field.main() == 2
     assert "manifest.json" in capsys.readouterr().err

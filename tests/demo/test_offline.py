@@ -31,9 +31,7 @@ def field(tiny_gaussians: Gaussians) -> SplatField:
     return SplatField(tiny_gaussians)
 
 
-def test_a_decoded_file_is_the_senders_closed_loop(
-    drive: Dataset, field: SplatField, tmp_path: Path
-) -> None:
+def test_a_decoded_file_is_the_senders_closed_loop(drive, field, tmp_path):
     path = tmp_path / "drive.rfv"
     write_drive(path, encode_drive(drive, field, SETTINGS))
     encoder = DeltaEncoder(CodecConfig(96, 64, "fast", 27.0))
@@ -48,9 +46,7 @@ def test_a_decoded_file_is_the_senders_closed_loop(
         assert frame.frame.digest() == own.reconstruction.digest()
 
 
-def test_a_drive_coded_with_a_mask_decodes(
-    drive: Dataset, field: SplatField, tmp_path: Path
-) -> None:
+def test_a_drive_coded_with_a_mask_decodes(drive, field, tmp_path):
     mask = np.zeros((64, 96, 3), np.uint8)
     mask[:32] = 255
     write_png(tmp_path / "mask.png", mask)
@@ -62,7 +58,7 @@ def test_a_drive_coded_with_a_mask_decodes(
     assert len(list(decode_drive(coded, field))) == 4
 
 
-def test_another_field_is_refused_with_both_ids_named(drive: Dataset, field: SplatField) -> None:
+def test_another_field_is_refused_with_both_ids_named(drive, field):
     coded = encode_drive(drive, field, SETTINGS)
     g = field.gaussians
     other = SplatField(Gaussians(g.means + 1, g.quaternions, g.log_scales, g.opacity_logits, g.sh))

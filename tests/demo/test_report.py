@@ -89,7 +89,7 @@ def pictures(count: int = 3) -> list[Pictures]:
     return [Pictures(f"drive/{k:03d}.png", grey, grey + 9, grey + 2) for k in range(count)]
 
 
-def test_the_page_has_every_drive_and_figure_and_needs_no_other_file(tmp_path: Path) -> None:
+def test_the_page_has_every_drive_and_figure_and_needs_no_other_file(tmp_path):
     path = tmp_path / "report.html"
     result = result_of(empty=DRIVE, vehicles=replace(DRIVE, saving_vs_x264_percent=-3.21))
     write_report(path, result, {"empty": pictures(), "vehicles": pictures()})
@@ -107,9 +107,7 @@ def test_the_page_has_every_drive_and_figure_and_needs_no_other_file(tmp_path: P
     assert re.findall(r"(?:src|href)=.(?!data:|#)[^>]*", page) == []
 
 
-def test_the_player_has_every_frame_the_strips_the_worst_and_the_video_is_within(
-    tmp_path: Path,
-) -> None:
+def test_the_player_has_every_frame_the_strips_the_worst_and_the_video_is_within(tmp_path):
     frames = [frame(k, 40.0 - 5 * (k == 3)) for k in range(7)]
     video = tmp_path / "v.mp4"
     video.write_bytes(b"a film")
@@ -131,7 +129,7 @@ def _page(folder: Path) -> str:
     return (folder / "r.html").read_text()
 
 
-def test_names_from_outside_cannot_break_the_page(tmp_path: Path) -> None:
+def test_names_from_outside_cannot_break_the_page(tmp_path):
     frames = [replace(frame(0, 35.0), name="<b>x</b>")]
     shots = [replace(pictures(1)[0], name="<b>x</b>")]
     result = result_of(**{"<i>empty</i>": replace(DRIVE, per_frame=frames)})
@@ -140,10 +138,10 @@ def test_names_from_outside_cannot_break_the_page(tmp_path: Path) -> None:
     assert "<i>empty" not in _page(tmp_path)
 
 
-def test_at_80_columns_the_summary_has_each_figure_whole(tmp_path: Path) -> None:
+def test_at_80_columns_the_summary_has_each_figure_whole(tmp_path):
     console = Console(file=io.StringIO(), width=80)
     print_summary(console, result_of(empty=DRIVE, vehicles=DRIVE), tmp_path)
-    text = console.file.getvalue()  # type: ignore[attr-defined]
+    text = console.file.getvalue()
     for shown in ("170.7 / 173.3 / 174.8", "34.58 dB; 0.907", "44.8 %", "208 / 329 ms"):
         (line,) = [x for x in text.splitlines() if shown in x]
         assert line.count(shown) == 2
@@ -163,7 +161,7 @@ def rgb_psnr_db(decoded: I420, frame: I420) -> float:
     return psnr(rgb_from_i420(decoded), rgb_from_i420(frame))
 
 
-def test_more_bytes_buy_more_quality_on_a_rivals_curve() -> None:
+def test_more_bytes_buy_more_quality_on_a_rivals_curve():
     frames = [i420_from_rgb(rgb) for rgb in moving()]
     crfs = (38.0, 18.0, 26.0, 32.0)
     curve = rival_curve(frames, x264_for_psnr("veryfast"), 10.0, crfs, rgb_psnr_db)
@@ -175,13 +173,13 @@ def test_more_bytes_buy_more_quality_on_a_rivals_curve() -> None:
     assert saving == pytest.approx(50.0)
 
 
-def test_prediction_makes_x264_cheaper_than_its_i_pictures() -> None:
+def test_prediction_makes_x264_cheaper_than_its_i_pictures():
     """Against the stronger rival the same packets save less."""
     rivals = Rivals(moving(), "veryfast", 10.0)
     intra, x264 = (f(400.0, 36.0) for f in (rivals.saving_vs_intra, rivals.saving_vs_x264))
     assert x264 < intra
 
 
-def test_a_curve_of_nothing_is_refused() -> None:
+def test_a_curve_of_nothing_is_refused():
     with pytest.raises(InvalidInput, match="at least one frame"):
         rival_curve([], x264_for_psnr("veryfast"), 10.0, (20.0,), rgb_psnr_db)

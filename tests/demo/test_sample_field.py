@@ -22,7 +22,7 @@ RAW_BYTES_A_SPLAT = 4 * (3 + 4 + 3 + 1 + 48)
 
 
 @pytest.mark.sample
-def test_the_shipped_field_is_whole_and_small() -> None:
+def test_the_shipped_field_is_whole_and_small():
     check_sample_field(SAMPLE)
     path = sample_field_path(SAMPLE)
     field = load_field(path)
@@ -33,7 +33,7 @@ def test_the_shipped_field_is_whole_and_small() -> None:
 
 
 @pytest.mark.sample
-def test_the_shipped_field_is_as_good_as_its_record_says() -> None:
+def test_the_shipped_field_is_as_good_as_its_record_says():
     """Measured again on six of the 24 pictures: their mean strays by less than half a dB."""
     path = sample_field_path(SAMPLE)
     stated_db = json.loads(path.with_suffix(".json").read_text())["held_out"]["psnr_db"]
@@ -50,7 +50,7 @@ def test_the_shipped_field_is_as_good_as_its_record_says() -> None:
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.timeout(600)
-def test_compression_costs_a_quarter_of_the_bytes_and_a_fifth_of_a_db_at_most() -> None:
+def test_compression_costs_a_quarter_of_the_bytes_and_a_fifth_of_a_db_at_most():
     views = read_dataset(SAMPLE / "transforms_train.json")
     drive = read_dataset(SAMPLE / "transforms_drive_empty.json")
     config = SplatTrainingConfig(

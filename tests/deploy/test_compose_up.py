@@ -76,25 +76,23 @@ def eventually(ask: Callable[[], Any]) -> Any:
 
 
 @pytest.mark.parametrize("image", LIMIT_BYTES)
-def test_an_image_is_small_enough(image: str) -> None:
+def test_an_image_is_small_enough(image):
     size_bytes = int(run("docker", "image", "inspect", image, "--format", "{{.Size}}"))
     assert size_bytes <= LIMIT_BYTES[image]
 
 
-def test_the_runtime_image_has_neither_torch_nor_opencv() -> None:
+def test_the_runtime_image_has_neither_torch_nor_opencv():
     listed = run("docker", "run", "--rm", "rfedge-runtime:local", "sh", "-c",
                  "ls /opt/rfedge/lib/python3.11/site-packages")  # fmt: skip
     assert not {"torch", "cv2", "matplotlib"} & set(listed.split())
 
 
-def test_the_full_image_trains() -> None:
+def test_the_full_image_trains():
     run("docker", "run", "--rm", "--read-only", "--tmpfs", "/tmp", "rfedge-full:local",
         "python", "-c", "import torch, cv2, matplotlib, rfedge.training.run")  # fmt: skip
 
 
-def test_every_target_is_up_and_every_vehicle_is_seen(
-    prometheus: Callable[[str], list[Any]],
-) -> None:
+def test_every_target_is_up_and_every_vehicle_is_seen(prometheus):
     eventually(lambda: len(prometheus("up == 1")) == 10)
     seen = 'sum by (instance) (rfedge_agent_frames_total{result="acked"}) > 20'
     eventually(lambda: len(prometheus(seen)) == 4)

@@ -3,7 +3,6 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -32,7 +31,7 @@ def served() -> set[str]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_a_dashboard_is_one_that_grafana_takes(path: Path) -> None:
+def test_a_dashboard_is_one_that_grafana_takes(path):
     dashboard = json.loads(path.read_text())
     assert dashboard["uid"] == path.stem
     assert len(dashboard["uid"]) <= 40, "Grafana's limit"
@@ -46,7 +45,7 @@ def test_a_dashboard_is_one_that_grafana_takes(path: Path) -> None:
 
 
 @pytest.mark.parametrize("panel", PANELS)
-def test_a_panel_has_a_unit_a_description_and_asks_for_what_exists(panel: dict[str, Any]) -> None:
+def test_a_panel_has_a_unit_a_description_and_asks_for_what_exists(panel):
     assert panel["title"]
     assert panel["description"].endswith(".")
     assert panel["fieldConfig"]["defaults"]["unit"] in UNITS
@@ -58,7 +57,7 @@ def test_a_panel_has_a_unit_a_description_and_asks_for_what_exists(panel: dict[s
         assert set(asked) <= served() | RECORDED, target["expr"]
 
 
-def test_the_data_source_is_the_one_that_is_provisioned() -> None:
+def test_the_data_source_is_the_one_that_is_provisioned():
     provisioned = (DEPLOY / "grafana/provisioning/datasources/prometheus.yaml").read_text()
     assert f"uid: {DATASOURCE['uid']}\n" in provisioned
     assert f"type: {DATASOURCE['type']}\n" in provisioned
@@ -79,7 +78,7 @@ def labels_of(expr: str) -> set[str]:
 
 
 @pytest.mark.parametrize("panel", PANELS)
-def test_a_legend_tells_the_series_of_its_panel_apart(panel: dict[str, Any]) -> None:
+def test_a_legend_tells_the_series_of_its_panel_apart(panel):
     """Two lines of one name cannot be read: a server's age of the twin is one line a vehicle."""
     if panel["type"] == "table":
         return
@@ -89,7 +88,7 @@ def test_a_legend_tells_the_series_of_its_panel_apart(panel: dict[str, Any]) -> 
         assert labels_of(target["expr"]) <= set(re.findall(r"\{\{(\w+)\}\}", legend))
 
 
-def test_the_labels_of_an_expression_are_found() -> None:
+def test_the_labels_of_an_expression_are_found():
     assert labels_of("rfedge_twin_age_seconds{instance=~'$instance'}") == {"instance", "vehicle"}
     assert labels_of("rate(rfedge_link_bytes_total[1m])") == {"instance", "direction"}
     assert labels_of("histogram_quantile(0.5, sum by (instance, le) (rate(x[1m])))") == {"instance"}

@@ -37,7 +37,7 @@ def pods() -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_every_resource_is_valid_to_the_letter(version: str) -> None:
+def test_every_resource_is_valid_to_the_letter(version):
     from kubernetes_validate import validate
 
     resources = documents()
@@ -46,7 +46,7 @@ def test_every_resource_is_valid_to_the_letter(version: str) -> None:
         validate(document, version, strict=True)
 
 
-def test_the_schemas_refuse_what_is_misspelt() -> None:
+def test_the_schemas_refuse_what_is_misspelt():
     from kubernetes_validate import ValidationError, validate
 
     broken = the("StatefulSet", "mec-server")
@@ -55,14 +55,14 @@ def test_the_schemas_refuse_what_is_misspelt() -> None:
         validate(broken, VERSIONS[0], strict=True)
 
 
-def test_the_kustomization_lists_every_file() -> None:
+def test_the_kustomization_lists_every_file():
     listed = yaml.safe_load((FOLDER / "kustomization.yaml").read_text())
     (generated,) = listed["configMapGenerator"]
     named = {"kustomization.yaml", *listed["resources"], *generated["files"]}
     assert named == {path.name for path in FOLDER.iterdir()}
 
 
-def test_selectors_find_pods_and_names_what_they_name() -> None:
+def test_selectors_find_pods_and_names_what_they_name():
     labels = set(pods())
     for document in documents():
         text = yaml.safe_dump(document["spec"])
@@ -85,7 +85,7 @@ def test_selectors_find_pods_and_names_what_they_name() -> None:
         assert {p.get("httpGet", p.get("tcpSocket"))["port"] for p in probes} <= ports
 
 
-def test_the_adapter_offers_the_metric_that_servers_are_scaled_by() -> None:
+def test_the_adapter_offers_the_metric_that_servers_are_scaled_by():
     (rule,) = yaml.safe_load((ROOT / "deploy/prometheus/adapter.yaml").read_text())["rules"]
     (metric,) = the("HorizontalPodAutoscaler", "mec-server")["spec"]["metrics"]
     name = metric["pods"]["metric"]["name"]
@@ -93,7 +93,7 @@ def test_the_adapter_offers_the_metric_that_servers_are_scaled_by() -> None:
     assert rule["seriesQuery"].partition("{")[0] == name
 
 
-def test_servers_may_reach_nats_and_names_and_nothing_else() -> None:
+def test_servers_may_reach_nats_and_names_and_nothing_else():
     egress = the("NetworkPolicy", "servers")["spec"]["egress"]
     reached = {
         (to["namespaceSelector"]["matchLabels"]["kubernetes.io/metadata.name"], port["port"])
@@ -104,7 +104,7 @@ def test_servers_may_reach_nats_and_names_and_nothing_else() -> None:
     assert reached == {("nats", 4222), ("kube-system", 53)}
 
 
-def test_servers_are_started_with_options_that_there_are(tmp_path: Path) -> None:
+def test_servers_are_started_with_options_that_there_are(tmp_path):
     import tyro
 
     from mec_server.config import ServerConfig
@@ -122,7 +122,7 @@ def test_servers_are_started_with_options_that_there_are(tmp_path: Path) -> None
     assert grace_s >= 2 * (config.drain_hold_s + config.drain_s)
 
 
-def test_envoy_differs_from_the_one_that_is_run_in_where_it_listens_and_finds_servers() -> None:
+def test_envoy_differs_from_the_one_that_is_run_in_where_it_listens_and_finds_servers():
     here, run = (
         yaml.safe_load(path.read_text())["static_resources"]
         for path in (FOLDER / "envoy.yaml", ROOT / "deploy/envoy/envoy-mtls.yaml")

@@ -46,11 +46,11 @@ def validate(resource: Mapping[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("key", OWN)
-def test_every_resource_is_valid_to_the_letter(key: tuple[str, str]) -> None:
+def test_every_resource_is_valid_to_the_letter(key):
     validate(OWN[key])
 
 
-def test_there_is_a_schema_for_every_kind_and_for_no_other() -> None:
+def test_there_is_a_schema_for_every_kind_and_for_no_other():
     assert {kind for kind, _ in OWN} == KINDS
     assert {path.stem for path in (FOLDER / "schemas").glob("*.json")} == KINDS
     readme = (FOLDER / "schemas/README.md").read_text()
@@ -58,19 +58,19 @@ def test_there_is_a_schema_for_every_kind_and_for_no_other() -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_the_schemas_refuse_what_is_misspelt(kind: str) -> None:
+def test_the_schemas_refuse_what_is_misspelt(kind):
     (resource,) = (found for (its, _), found in OWN.items() if its == kind)
     with pytest.raises(ValidationError, match="'targetRef5' was unexpected"):
         validate(resource | {"spec": resource["spec"] | {"targetRef5": []}})
 
 
-def test_the_kustomization_lists_every_file() -> None:
+def test_the_kustomization_lists_every_file():
     own = {name for name in kustomization()["resources"] if name.endswith(".yaml")}
     assert own | {"kustomization.yaml"} == {path.name for path in FOLDER.glob("*.yaml")}
     assert kustomization()["namespace"] == "rfedge"
 
 
-def test_streams_are_placed_by_the_metadata_that_vehicles_send() -> None:
+def test_streams_are_placed_by_the_metadata_that_vehicles_send():
     policy = OWN["BackendTrafficPolicy", "edge"]["spec"]["loadBalancer"]
     hashed = [header["name"] for header in policy["consistentHash"]["headers"]]
     assert hashed == [TILE, VEHICLE]
@@ -79,7 +79,7 @@ def test_streams_are_placed_by_the_metadata_that_vehicles_send() -> None:
     assert "matches" not in anything
 
 
-def test_references_find_what_they_name() -> None:
+def test_references_find_what_they_name():
     route, gateway = OWN["GRPCRoute", "edge"]["spec"], OWN["Gateway", "edge"]["spec"]
     (parent,) = route["parentRefs"]
     assert parent["sectionName"] in {listener["name"] for listener in gateway["listeners"]}
@@ -92,7 +92,7 @@ def test_references_find_what_they_name() -> None:
         assert (target["kind"], target["name"]) in OWN | BASE
 
 
-def test_patches_take_envoy_out_and_nothing_else() -> None:
+def test_patches_take_envoy_out_and_nothing_else():
     removed, changed = set(), set()
     for patch in kustomization()["patches"]:
         content, target = yaml.safe_load(patch["patch"]), patch["target"]
@@ -111,7 +111,7 @@ def test_patches_take_envoy_out_and_nothing_else() -> None:
     assert changed == {("NetworkPolicy", "servers")}
 
 
-def test_the_pods_of_the_gateway_are_who_reaches_the_servers() -> None:
+def test_the_pods_of_the_gateway_are_who_reaches_the_servers():
     (patch,) = (p for p in kustomization()["patches"] if p["target"]["name"] == "servers")
     (operation,) = yaml.safe_load(patch["patch"])
     assert (operation["op"], operation["path"]) == ("replace", "/spec/ingress/0/from")
@@ -124,7 +124,7 @@ def test_the_pods_of_the_gateway_are_who_reaches_the_servers() -> None:
     }
 
 
-def test_policies_say_what_the_configuration_that_is_run_says() -> None:
+def test_policies_say_what_the_configuration_that_is_run_says():
     config = yaml.safe_load((ROOT / "deploy/envoy/envoy-mtls.yaml").read_text())
     (cluster,) = config["static_resources"]["clusters"]
     (check,) = cluster["health_checks"]

@@ -92,7 +92,7 @@ def prefix(resource: Resource, text: str) -> None:
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("group", ["any", *GROUPS])
-def test_every_resource_is_valid_to_the_letter(group: str, version: str) -> None:
+def test_every_resource_is_valid_to_the_letter(group, version):
     from kubernetes_validate import validate
 
     resources = made(group)
@@ -101,7 +101,7 @@ def test_every_resource_is_valid_to_the_letter(group: str, version: str) -> None
         validate(resource, version, strict=True)
 
 
-def test_no_two_groups_have_a_name_or_a_pod_in_common() -> None:
+def test_no_two_groups_have_a_name_or_a_pod_in_common():
     every = [key for group in ("any", *GROUPS) for key in made(group)]
     assert len(every) == len(set(every))
     for group in ("any", *GROUPS):
@@ -118,7 +118,7 @@ def test_no_two_groups_have_a_name_or_a_pod_in_common() -> None:
         assert claim == ("fields" if group == "any" else f"fields-{group}")
 
 
-def test_policies_are_those_of_every_group_and_go_by_the_label_app() -> None:
+def test_policies_are_those_of_every_group_and_go_by_the_label_app():
     policies = {key: found for key, found in made("any").items() if key[0] == "NetworkPolicy"}
     base = {(d["kind"], d["metadata"]["name"]): d for d in documents()}
     assert policies
@@ -126,7 +126,7 @@ def test_policies_are_those_of_every_group_and_go_by_the_label_app() -> None:
     assert not any(kind == "NetworkPolicy" for group in GROUPS for kind, _ in made(group))
 
 
-def test_the_kustomization_lists_every_file_and_replaces_envoys_configuration() -> None:
+def test_the_kustomization_lists_every_file_and_replaces_envoys_configuration():
     top = kustomization(".")
     assert top["resources"] == ["any", *GROUPS]
     (generated,) = top["configMapGenerator"]
@@ -135,7 +135,7 @@ def test_the_kustomization_lists_every_file_and_replaces_envoys_configuration() 
     assert files == {"kustomization.yaml", "envoy.yaml", *top["resources"]}
 
 
-def test_envoy_has_a_route_and_a_cluster_for_each_group_and_nothing_else_is_another() -> None:
+def test_envoy_has_a_route_and_a_cluster_for_each_group_and_nothing_else_is_another():
     one, groups = (
         yaml.safe_load((folder / "envoy.yaml").read_text())
         for folder in (ROOT / "deploy/kubernetes", FOLDER)
@@ -170,7 +170,7 @@ def routes_of(config: Resource) -> list[Resource]:
     return routes
 
 
-def test_envoy_accepts_the_configuration(tmp_path: Path) -> None:
+def test_envoy_accepts_the_configuration(tmp_path):
     members = Members((), proxies=("edge-proxy",))
     write_certificates(tmp_path / "certs", certify(members, datetime.now(UTC), days=30))
     check_config(EnvoySetup(envoy_binary(), FOLDER / "envoy.yaml", tmp_path))

@@ -21,18 +21,18 @@ def passes(*command: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.prometheus
-def test_promtool_accepts_rules_and_configuration(promtool: str) -> None:
+def test_promtool_accepts_rules_and_configuration(promtool):
     passes(promtool, "check", "rules", "rules.yml")
     passes(promtool, "check", "config", "prometheus.yml")
 
 
 @pytest.mark.slow
 @pytest.mark.prometheus
-def test_promtool_finds_that_the_rules_do_what_they_say(promtool: str) -> None:
+def test_promtool_finds_that_the_rules_do_what_they_say(promtool):
     passes(promtool, "test", "rules", "tests/recording.yml", "tests/alerts.yml")
 
 
-def test_the_rules_ask_only_for_metrics_that_exist() -> None:
+def test_the_rules_ask_only_for_metrics_that_exist():
     asked = set(re.findall(r"(?<![\w:])((?:rfedge|process)_\w+)(?!\w*:)", RULES))
     known = set(DECLARED)
     for family in DECLARED.values():
@@ -42,10 +42,5 @@ def test_the_rules_ask_only_for_metrics_that_exist() -> None:
 
 
 @pytest.mark.parametrize("name", re.findall(r"- (?:record|alert): (\S+)", RULES))
-def test_every_rule_has_a_test(name: str) -> None:
+def test_every_rule_has_a_test(name):
     assert name in TESTS
-
-
-def test_every_alert_says_what_to_do() -> None:
-    alerts = RULES.count("- alert:")
-    assert alerts == RULES.count("summary:") == RULES.count("description:") == RULES.count("sever")

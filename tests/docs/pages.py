@@ -1,28 +1,14 @@
 """The pages of the documentation, their fenced blocks, and the commands in them."""
 
-import importlib.util
 import re
 import shlex
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PROGRAMS = ("rfedge", "cav-agent", "mec-server", "streetgen", "rfedge-lab")
-
-
-def load_build_site() -> Any:
-    """Load ``docs/build_site.py``, which is in no package."""
-    spec = importlib.util.spec_from_file_location("build_site", DOCS / "build_site.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @dataclass(frozen=True)

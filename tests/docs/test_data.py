@@ -27,7 +27,7 @@ OFFSET_S = 12.5
 BODY_FROM_CAM = Pose.from_matrix([[0, 0, 1, 1.2], [-1, 0, 0, 0], [0, -1, 0, 1.4]])
 
 
-def test_the_toml_of_the_page_has_only_keys_that_are_read() -> None:
+def test_the_toml_of_the_page_has_only_keys_that_are_read():
     content = tomllib.loads("\n".join(PAGE.blocks("toml")))
     assert set(content) == set(SECTIONS)
     for section, keys in content.items():
@@ -36,9 +36,7 @@ def test_the_toml_of_the_page_has_only_keys_that_are_read() -> None:
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_the_commands_lead_from_recordings_to_a_decoded_drive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commands_lead_from_recordings_to_a_decoded_drive(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     make_recording(Path("my-street"), "transforms_drive_empty.json", with_points=True)
     make_recording(Path("my-drive"), "transforms_drive_vehicles.json", with_points=False)
@@ -84,7 +82,6 @@ def make_recording(folder: Path, transforms: str, *, with_points: bool) -> None:
     (folder / "camera.toml").write_text(text)
     if with_points:
         points = read_dataset(SAMPLE / "transforms_train.json").points
-        assert points is not None
         few = slice(None, None, 50)
         write_points(
             folder / "lidar.ply",

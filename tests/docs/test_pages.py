@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 import rfedge.cli
-from docs.pages import DOCS, PROGRAMS, ROOT, Page, commands, load_build_site
+from docs.pages import DOCS, PROGRAMS, ROOT, Page, commands
 from lab.pages.metrics import families
+from scripts import loaded
 
-build_site = load_build_site()
+build_site = loaded("docs/build_site.py")
 PAGES = sorted(DOCS.rglob("*.md"))
 OTHERS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
 WRITTEN = [page for page in PAGES if page.parent != DOCS] + OTHERS
@@ -25,7 +26,7 @@ def prose_and_blocks(page: Path) -> tuple[str, list[str]]:
 
 
 @pytest.mark.parametrize("page", WRITTEN, ids=ids)
-def test_links_lead_to_files_and_generated_pages(page: Path) -> None:
+def test_links_lead_to_files_and_generated_pages(page):
     prose, _ = prose_and_blocks(page)
     generated = {DOCS / "reference" / name for name in build_site.reference_names()}
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", prose):
@@ -47,9 +48,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("words", LINES, ids=" ".join)
-def test_every_command_is_one(
-    words: tuple[str, ...], certificates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_command_is_one(words, certificates, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     given = list(words)
     for place, (option, value) in enumerate(pairwise(words), 1):
@@ -61,7 +60,7 @@ def test_every_command_is_one(
 
 
 @pytest.mark.parametrize("page", WRITTEN, ids=ids)
-def test_options_named_in_prose_exist(page: Path) -> None:
+def test_options_named_in_prose_exist(page):
     prose, _ = prose_and_blocks(page)
     for span in re.findall(r"`([^`]+)`", prose):
         program = span.split(" ")[0]
@@ -79,14 +78,14 @@ FOLDERS = (*SOURCES, "tests", "deploy", "docs", "examples", "samples", "proto", 
 
 
 @pytest.mark.parametrize("spans", SPANS.values(), ids=SPANS)
-def test_files_named_in_prose_exist(spans: list[str]) -> None:
+def test_files_named_in_prose_exist(spans):
     for span in spans:
         if re.fullmatch(rf"(?:{'|'.join(FOLDERS)})/[\w./-]*", span) and "NAME" not in span:
             assert (ROOT / span).exists(), span
 
 
 @pytest.mark.parametrize("spans", SPANS.values(), ids=SPANS)
-def test_python_names_in_prose_exist(spans: list[str]) -> None:
+def test_python_names_in_prose_exist(spans):
     for span in spans:
         name = re.match(rf"(?:{'|'.join(SOURCES)})(?:\.\w+)+(?::[\w.]+)?(?=\(|$)", span)
         subject_of_nats = re.search(r"\.(VEHICLE|ENCODING)\b", span)
@@ -108,7 +107,7 @@ def resolved(name: str) -> object:
     raise AssertionError(name)
 
 
-def test_tests_named_in_prose_exist() -> None:
+def test_tests_named_in_prose_exist():
     sources = "".join(path.read_text(encoding="utf-8") for path in ROOT.glob("tests/**/*.py"))
     defined = set(re.findall(r"def (test_\w+)", sources))
     named = {span for spans in SPANS.values() for span in spans if span.startswith("test_")}
@@ -116,7 +115,7 @@ def test_tests_named_in_prose_exist() -> None:
     assert named, "explanation/method.md names tests"
 
 
-def test_programs_have_their_page_with_every_verb() -> None:
+def test_programs_have_their_page_with_every_verb():
     pages = build_site.command_pages()
     assert set(pages) == {f"commands/{name}.md" for name in PROGRAMS}
     for verb in ("train", "field publish", "eval compare"):
@@ -124,14 +123,14 @@ def test_programs_have_their_page_with_every_verb() -> None:
     assert "| `--drain-hold-s FLOAT` |" in pages["commands/mec-server.md"]
 
 
-def test_every_metric_and_message_is_in_the_reference() -> None:
+def test_every_metric_and_message_is_in_the_reference():
     for declared in families().values():
         for family in declared:
             assert f"`{family.name}`" in build_site.metrics_page()
     assert "message Hello {" in build_site.protocol_page()
 
 
-def test_the_site_has_every_page_of_its_contents(tmp_path: Path) -> None:
+def test_the_site_has_every_page_of_its_contents(tmp_path):
     build_site.collect(tmp_path / "site")
     contents = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     named = set(re.findall(r"[\w/-]+\.md", contents.partition("nav:")[2]))
@@ -139,6 +138,6 @@ def test_the_site_has_every_page_of_its_contents(tmp_path: Path) -> None:
     assert len(named) > len(PROGRAMS)
 
 
-def test_the_tutorials_are_pages() -> None:
+def test_the_tutorials_are_pages():
     tutorials = [page for page in PAGES if page.parent.name == "tutorials"]
     assert all(Page(str(page.relative_to(DOCS))).blocks("sh") for page in tutorials)

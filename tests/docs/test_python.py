@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -13,7 +12,7 @@ SAMPLE = ROOT / "samples" / "street" / "transforms_drive_empty.json"
 
 
 @pytest.mark.sample
-def test_the_program_renders_encodes_and_decodes(tmp_path: Path) -> None:
+def test_the_program_renders_encodes_and_decodes(tmp_path):
     few = ["--size", "160x90", "--every", "8"]
     parse(["dataset", "convert", str(SAMPLE), "--out", str(tmp_path / "drive"), *few]).run()
     (tmp_path / "street.rff").symlink_to(ROOT / "samples" / "fields" / "street.rff")

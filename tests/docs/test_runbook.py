@@ -5,7 +5,7 @@ import itertools
 import os
 import shlex
 import shutil
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Iterable, Mapping
 from contextlib import AsyncExitStack
 from datetime import UTC, datetime
 from pathlib import Path
@@ -136,9 +136,7 @@ def every_result(vehicle: Any) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("desk")
-async def test_servers_are_updated_one_after_another_without_a_lost_frame(
-    vehicle: Any, stack: AsyncExitStack
-) -> None:
+async def test_servers_are_updated_one_after_another_without_a_lost_frame(vehicle, stack):
     operator = Operator(stack, vehicle)
     await operator.types(SERVE)
     (driving,) = operator.vehicles
@@ -177,9 +175,7 @@ def counted(server: Any) -> dict[str, float]:
 
 
 @pytest.mark.usefixtures("desk")
-async def test_a_canary_shows_that_bytes_rose_and_is_taken_back(
-    street: Any, vehicle: Any, serve: Any, stack: AsyncExitStack
-) -> None:
+async def test_a_canary_shows_that_bytes_rose_and_is_taken_back(street, vehicle, serve, stack):
     """The field that the page calls better is one of another place: bytes have to rise."""
     assert "rfedge_server_tile_payload_bytes_total" in PAGE.text
     operator = Operator(stack, vehicle, serve)
@@ -202,8 +198,8 @@ async def test_a_canary_shows_that_bytes_rose_and_is_taken_back(
 @pytest.mark.slow
 @pytest.mark.usefixtures("desk")
 async def test_a_share_of_a_tiles_vehicles_tries_a_field_behind_envoy_and_is_taken_back(
-    street: Any, vehicle: Any, stack: AsyncExitStack, tmp_path: Path
-) -> None:
+    street, vehicle, stack, tmp_path
+):
     """The field that the page calls better is one of another place: bytes have to rise."""
     start, share, take_back = SHARE
     groups = await asyncio.to_thread(Groups, street, tmp_path, stack)
@@ -290,9 +286,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.usefixtures("desk")
-async def test_what_is_published_is_backed_up_and_restored(
-    street: Any, stack: AsyncExitStack, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_what_is_published_is_backed_up_and_restored(street, stack, capsys):
     operator = Operator(stack, None)
     await operator.types(EVERYWHERE)
     published = contents(Path("fields"))
@@ -314,9 +308,6 @@ def damage(archive: Path) -> None:
     archive.write_bytes(data)
 
 
-BitsIncrease = Callable[[Path, Path], None]
-
-
 @pytest.mark.parametrize(
     ("harm", "says"),
     [
@@ -329,9 +320,7 @@ BitsIncrease = Callable[[Path, Path], None]
     ids=["earlier damaged", "earlier empty", "current damaged", "current gone", "no manifest"],
 )
 @pytest.mark.usefixtures("desk")
-async def test_a_bad_copy_is_told(
-    street: Any, stack: AsyncExitStack, harm: BitsIncrease, says: str
-) -> None:
+async def test_a_bad_copy_is_told(street, stack, harm, says):
     await Operator(stack, None).types(EVERYWHERE)
     ids = street.field_id, street.other_id
     harm(Path(f"fields/{ids[0]}.rff"), Path(f"fields/{ids[1]}.rff"))
@@ -341,9 +330,7 @@ async def test_a_bad_copy_is_told(
 
 
 @pytest.mark.usefixtures("desk")
-async def test_an_earlier_version_may_be_gone(
-    street: Any, stack: AsyncExitStack, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_an_earlier_version_may_be_gone(street, stack, capsys):
     await Operator(stack, None).types(EVERYWHERE)
     Path(f"fields/{street.field_id}.rff").unlink()
     parse(["field", "list", "fields", "--verify"]).run()

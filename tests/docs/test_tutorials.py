@@ -92,7 +92,7 @@ def looking(at_m: tuple[float, float, float], heading: float) -> Pose:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.sample
-def test_pictures_become_a_field_and_saved_bits(tmp_path: Path) -> None:
+def test_pictures_become_a_field_and_saved_bits(tmp_path):
     make_pictures(tmp_path / "pictures", 16)
     script = "\n".join(SAVED.blocks("sh"))
     said = run(script, tmp_path, {"--minutes 2": "--minutes 0.3"}, 600)
@@ -128,7 +128,7 @@ def free_ports(count: int) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.usefixtures("sample_drive")
-def test_a_vehicle_drives_over_a_link_and_the_twin_shows_it(tmp_path: Path) -> None:
+def test_a_vehicle_drives_over_a_link_and_the_twin_shows_it(tmp_path):
     server, link, page = free_ports(3)
     publish, serve, connect, drive, watch, twin, worse, stop = LIVE.blocks("sh")
     look = f"exec 3<>/dev/tcp/127.0.0.1/{page}; printf 'GET / HTTP/1.0\\r\\n\\r\\n' >&3; cat <&3"

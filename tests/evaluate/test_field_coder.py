@@ -8,28 +8,16 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.errors import InvalidInput
-from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_colour
-from rfcore.raster.gaussians import Gaussians
 from rfedge.evaluate import field_coder
 from rfedge.evaluate.field_coder import WITHOUT_FIELD, FieldCoder, render_clip
+from tests.clouds import cloud
 
 INTRINSICS = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 
 
 def street(seed):
-    rng = np.random.default_rng(seed)
-    sh = np.zeros((300, 1, 3), np.float32)
-    sh[:, 0] = rng.uniform(-1.5, 1.5, (300, 3))
-    return SplatField(
-        Gaussians(
-            means=rng.uniform([-3, -2, 4], [3, 2, 8], (300, 3)).astype(np.float32),
-            quaternions=np.tile(np.float32([1, 0, 0, 0]), (300, 1)),
-            log_scales=np.full((300, 3), np.log(0.25), np.float32),
-            opacity_logits=np.full(300, 2.0, np.float32),
-            sh=sh,
-        )
-    )
+    return cloud(seed, 300, [-3, -2, 4], [3, 2, 8], 0.25)
 
 
 CAMERAS = [Camera(INTRINSICS, Pose((0.05 * k, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))) for k in range(4)]

@@ -10,9 +10,7 @@ from rich.console import Console
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_colour
-from rfcore.raster.gaussians import Gaussians
 from rfcore.views import PosedPicture
 from rfedge.evaluate.clips import Drive, DriveName
 from rfedge.evaluate.never_worse import EvalNeverWorse
@@ -23,29 +21,15 @@ from rfedge.evaluate.never_worse.measure import (
     run_never_worse,
 )
 from rfedge.jobs import CellStore
+from tests.clouds import cloud
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 INTRINSICS = Intrinsics(160, 96, 120.0, 120.0, 80.0, 48.0)
 CAMERAS = [Camera(INTRINSICS, Pose((0.02 * k, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))) for k in range(4)]
 
 
-def street(seed, count=4000):
-    """A wall of small splats 4 m ahead; to the left there is nothing."""
-    rng = np.random.default_rng(seed)
-    sh = np.zeros((count, 1, 3), np.float32)
-    sh[:, 0] = rng.uniform(-1.5, 1.5, (count, 3))
-    return SplatField(
-        Gaussians(
-            means=rng.uniform([-3, -2, 4], [3, 2, 4.2], (count, 3)).astype(np.float32),
-            quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-            log_scales=np.full((count, 3), np.log(0.06), np.float32),
-            opacity_logits=np.full(count, 2.0, np.float32),
-            sh=sh,
-        )
-    )
-
-
-FIELD = street(1)
+FIELD = cloud(1, 4000, [-3, -2, 4], [3, 2, 4.2], 0.06)
+"A wall of small splats 4 m ahead; to the left there is nothing."
 
 
 def drive():
@@ -72,12 +56,6 @@ def test_the_controls_are_another_place_and_nothing_at_the_same_poses(seen):
     assert {int(plane.max()) for plane in black.renders[0].planes} == {16, 128}
     assert black.views[0].depth.max() == 0
     assert not any(mask.any() for mask in black.covered)
-
-
-def test_every_fifth_frame_is_a_fifth_of_the_rate():
-    slow = drive().every(2)
-    assert (slow.name.rate_hz, len(slow.frames)) == (5.0, 2)
-    assert slow.pictures[1].name == "2"
 
 
 def test_a_row_tells_excess_without_header_and_whether_it_holds(tmp_path, seen):

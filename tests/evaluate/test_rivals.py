@@ -178,21 +178,6 @@ def test_av1_rivals_run_with_low_delay_at_their_presets():
         assert rival.options["svtav1-params"] == "pred-struct=1:keyint=-1:lp=1:rc=0"
 
 
-def test_the_families_are_the_anchors_and_what_is_stronger():
-    families = rival_families("veryfast", quick=False)
-    names = {family: [rival.name for rival in rivals] for family, rivals in families.items()}
-    assert names["x264-lowdelay"] == ["x264-lowdelay-veryfast"]
-    assert names["x264-lowdelay-psnr"] == ["x264-lowdelay-psnr-veryfast"]
-    assert names["x264-stronger"] == ["x264-lowdelay-psnr-medium", "x264-lowdelay-psnr-veryslow"]
-    assert len(names["x265-lowdelay"]) == 3
-    assert len(names["svtav1-lowdelay"]) == 4
-    for preset in ("veryfast", "medium", "veryslow"):
-        assert names[f"x264-our-tools-{preset}"] == [f"x264-our-tools-{preset}"]
-    assert names["x265-medium"] == ["x265-lowdelay-psnr-medium"]
-    assert names["svtav1-p6"] == ["svtav1-lowdelay-p6"]
-    assert rival_families("veryfast", quick=True).keys() <= families.keys()
-
-
 def test_another_option_is_another_version():
     plain = x264_lowdelay("veryfast")
     weaker = x264_lowdelay("veryfast", plain.name, subme="0")

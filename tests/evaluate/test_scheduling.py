@@ -14,7 +14,7 @@ def policies() -> set[int]:
     return {os.sched_getscheduler(int(task.name)) for task in Path("/proc/self/task").iterdir()}
 
 
-def test_svtav1_leaves_our_scheduling_as_it_was() -> None:
+def test_svtav1_leaves_our_scheduling_as_it_was():
     before = policies()
     luma = np.random.default_rng(0).integers(0, 256, (64, 64), np.uint8)
     frame = I420(luma, luma[::2, ::2].copy(), luma[1::2, 1::2].copy())
@@ -22,7 +22,7 @@ def test_svtav1_leaves_our_scheduling_as_it_was() -> None:
     assert policies() == before
 
 
-def test_a_policy_taken_inside_is_given_back() -> None:
+def test_a_policy_taken_inside_is_given_back():
     before = os.sched_getscheduler(0)
     with ordinary_scheduling():
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
@@ -35,7 +35,7 @@ def taken_until_an_error() -> None:
         raise RuntimeError("no encoder")
 
 
-def test_it_is_given_back_after_an_error() -> None:
+def test_it_is_given_back_after_an_error():
     before = os.sched_getscheduler(0)
     with pytest.raises(RuntimeError, match="no encoder"):
         taken_until_an_error()

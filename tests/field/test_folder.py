@@ -4,8 +4,6 @@ import hashlib
 import os
 from pathlib import Path
 
-import pytest
-
 from rfcore.field.archive import MAGIC, Archive, encode_archive
 from rfcore.field.folder import MAX_ARCHIVE_BYTES, FieldFolder
 
@@ -16,7 +14,7 @@ def archive(path: Path, content: bytes = b"field") -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def test_entries_that_are_no_archives_are_skipped_with_their_reason(tmp_path: Path) -> None:
+def test_entries_that_are_no_archives_are_skipped_with_their_reason(tmp_path):
     field_id = archive(tmp_path / "street.rff")
     (tmp_path / "folder.rff").mkdir()
     os.mkfifo(tmp_path / "pipe.rff")
@@ -46,7 +44,7 @@ def test_entries_that_are_no_archives_are_skipped_with_their_reason(tmp_path: Pa
     }
 
 
-def test_a_link_to_an_archive_is_an_archive(tmp_path: Path) -> None:
+def test_a_link_to_an_archive_is_an_archive(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "fields").mkdir()
     field_id = archive(tmp_path / "elsewhere" / "street")
@@ -54,14 +52,12 @@ def test_a_link_to_an_archive_is_an_archive(tmp_path: Path) -> None:
     assert set(FieldFolder(tmp_path / "fields").look().paths) == {field_id}
 
 
-def test_a_file_is_read_once_until_it_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
     digest, digests = hashlib.file_digest, []
 
     def counted(file: object, name: str) -> object:
         digests.append(name)
-        return digest(file, name)  # type: ignore[arg-type]
+        return digest(file, name)
 
     monkeypatch.setattr(hashlib, "file_digest", counted)
     archive(tmp_path / "street.rff")
@@ -76,7 +72,7 @@ def test_a_file_is_read_once_until_it_changes(
     assert folder.look().paths == {}
 
 
-def test_a_file_that_grows_is_left_out_until_two_looks_find_it_the_same(tmp_path: Path) -> None:
+def test_a_file_that_grows_is_left_out_until_two_looks_find_it_the_same(tmp_path):
     folder, path = FieldFolder(tmp_path), tmp_path / "street.rff"
     archive(path, b"hal")
     assert folder.look(settled=True).paths == {}

@@ -16,14 +16,13 @@ from rfcore.field.importance import (
 from rfcore.field.splat_grid import Steps, colour_numbers, colours_of
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
+from tests.field.some import make_gaussians
 
 CAMERA = Camera(Intrinsics(40, 30, 30.0, 30.0, 20.0, 15.0), Pose((0, 0, -6), (1, 0, 0, 0)))
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_all_contributions_together_are_the_opacity_of_the_picture(
-    make_gaussians, antialiased: bool
-) -> None:
+def test_all_contributions_together_are_the_opacity_of_the_picture(antialiased):
     """Tolerance: float32 sums of 1200 pixels, each rounded at 2^-24 of at most 1."""
     g = make_gaussians(60)
     opacity = Rasterizer(g, antialiased=antialiased).render(CAMERA).opacity.sum(dtype=np.float64)
@@ -41,14 +40,14 @@ def walls(depths_m: tuple[float, ...]) -> Gaussians:
     return Gaussians(means, turned, flat, np.full(n, 9, np.float32), np.zeros((n, 1, 3), "f4"))
 
 
-def test_what_nobody_sees_contributes_next_to_nothing() -> None:
+def test_what_nobody_sees_contributes_next_to_nothing():
     front, hidden, behind = contributions(walls((0.0, 1.0, -9.0)), [CAMERA])
     assert front > 0.98 * 40 * 30
     assert 0 <= hidden < 0.02 * front, "an alpha is at most 0.99"
     assert behind == 0
 
 
-def test_a_splat_matters_more_when_it_is_opaque_large_and_near() -> None:
+def test_a_splat_matters_more_when_it_is_opaque_large_and_near():
     flat = np.zeros((4, 1, 3), np.float32)
     means = np.zeros((4, 3), np.float32)
     means[3] = (0, 0, 50)
@@ -58,7 +57,7 @@ def test_a_splat_matters_more_when_it_is_opaque_large_and_near() -> None:
     assert all(best > 5 * other for other in others)
 
 
-def test_equal_splats_keep_their_order_and_none_gets_lost(make_gaussians) -> None:
+def test_equal_splats_keep_their_order_and_none_gets_lost():
     order = most_important_first(np.array([1.0, 3.0, 1.0, 3.0]))
     assert order.tolist() == [1, 3, 0, 2]
     g = make_gaussians(4)
@@ -66,7 +65,7 @@ def test_equal_splats_keep_their_order_and_none_gets_lost(make_gaussians) -> Non
     assert len(visible_area(make_gaussians(0))) == 0
 
 
-def test_contributions_to_no_camera_are_refused(make_gaussians) -> None:
+def test_contributions_to_no_camera_are_refused():
     with pytest.raises(InvalidInput, match="at least one"):
         contributions(make_gaussians(), [])
 
@@ -79,7 +78,7 @@ def seen_error(error: np.ndarray, seen: np.ndarray) -> float:
     return float(np.einsum("nkc,nkl,nlc->", error, seen, error))
 
 
-def test_directions_seen_are_those_of_the_cameras(make_gaussians) -> None:
+def test_directions_seen_are_those_of_the_cameras():
     """The constant coefficient is seen as often as the splat contributes, from anywhere."""
     g = make_gaussians(20, 2)
     seen = seen_directions(g, [CAMERA, CAMERA])
@@ -91,7 +90,7 @@ def test_directions_seen_are_those_of_the_cameras(make_gaussians) -> None:
     assert ranks.max() == 1, "one place is one direction for each splat"
 
 
-def test_without_a_price_colours_are_no_worse_than_the_nearest_ones(make_gaussians) -> None:
+def test_without_a_price_colours_are_no_worse_than_the_nearest_ones():
     g = make_gaussians(40, 3)
     seen = seen_directions(g, [CAMERA])
     nearest = colours_of(colour_numbers(g.sh, STEPS), STEPS)
@@ -100,7 +99,7 @@ def test_without_a_price_colours_are_no_worse_than_the_nearest_ones(make_gaussia
     assert np.array_equal(colours_of(colour_numbers(free.sh, STEPS), STEPS), free.sh), "on the grid"
 
 
-def test_a_price_trades_what_is_seen_for_zeros(make_gaussians) -> None:
+def test_a_price_trades_what_is_seen_for_zeros():
     g = make_gaussians(200, 3)
     seen = seen_directions(g, [CAMERA])
     errors, zeros = [], []
@@ -112,7 +111,7 @@ def test_a_price_trades_what_is_seen_for_zeros(make_gaussians) -> None:
     assert zeros == sorted(set(zeros))
 
 
-def test_colours_that_nobody_sees_cost_nothing_and_seen_ones_stay(make_gaussians) -> None:
+def test_colours_that_nobody_sees_cost_nothing_and_seen_ones_stay():
     g = make_gaussians(30, 3)
     hidden = reordered(g, np.arange(30))
     hidden.means[:, 2] = -9
@@ -124,7 +123,7 @@ def test_colours_that_nobody_sees_cost_nothing_and_seen_ones_stay(make_gaussians
     assert np.abs(after - before).max() < 0.05
 
 
-def test_matrices_of_other_splats_and_negative_prices_are_refused(make_gaussians) -> None:
+def test_matrices_of_other_splats_and_negative_prices_are_refused():
     g = make_gaussians(4, 1)
     seen = seen_directions(g, [CAMERA])
     with pytest.raises(InvalidInput, match=r"seen: \(3, 4, 4\) is not \(4, 4, 4\)"):

@@ -1,7 +1,6 @@
 """Columns of whole numbers survive their stream; a stream that lies is refused before it grows."""
 
 import lzma
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,14 +19,14 @@ matrices = hnp.arrays(
 
 
 @given(matrices)
-def test_numbers_survive_their_stream(values: np.ndarray) -> None:
+def test_numbers_survive_their_stream(values):
     header, stream = encode_columns(values)
     back = decode_columns(header, stream, values.shape)
     assert back.dtype == np.int32
     np.testing.assert_array_equal(back, values)
 
 
-def test_small_numbers_take_one_byte_each_before_coding() -> None:
+def test_small_numbers_take_one_byte_each_before_coding():
     header, stream = encode_columns(np.array([[-70_000, 5], [-69_745, 5]], np.int32))
     assert header == {"lowest": [-70_000, 5], "bytes": [1, 1]}
     assert lzma.decompress(stream.tobytes(), lzma.FORMAT_RAW, filters=FILTERS) == b"\0\xff\0\0"
@@ -53,16 +52,14 @@ def stream_of(data: bytes) -> np.ndarray:
         ({}, (50_000_000, 2), "claim to hold 100000000: a bomb"),
     ],
 )
-def test_a_header_that_lies_is_refused(
-    change: dict[str, Any], shape: tuple[int, int], named: str
-) -> None:
+def test_a_header_that_lies_is_refused(change, shape, named):
     header, stream = encode_columns(np.arange(12, dtype=np.int32).reshape(6, 2))
     with pytest.raises(InvalidInput, match=named):
         decode_columns({**header, **change}, stream, shape)
 
 
 @given(st.data())
-def test_a_damaged_stream_gives_numbers_of_the_shape_or_is_refused(data: st.DataObject) -> None:
+def test_a_damaged_stream_gives_numbers_of_the_shape_or_is_refused(data):
     """The stream has no checksum of its own, the archive has; nothing else may happen."""
     values = np.random.default_rng(0).integers(0, 300, (40, 3), dtype=np.int32)
     header, stream = encode_columns(values)
@@ -78,14 +75,14 @@ def test_a_damaged_stream_gives_numbers_of_the_shape_or_is_refused(data: st.Data
 
 
 @pytest.mark.parametrize("extra", [b"\0", b"more"])
-def test_bytes_after_the_stream_are_refused(extra: bytes) -> None:
+def test_bytes_after_the_stream_are_refused(extra):
     header, stream = encode_columns(np.zeros((4, 1), np.int32))
     longer = np.frombuffer(stream.tobytes() + extra, np.uint8)
     with pytest.raises(InvalidInput, match="does not hold"):
         decode_columns(header, longer, (4, 1))
 
 
-def test_a_bomb_is_refused_without_inflating_it() -> None:
+def test_a_bomb_is_refused_without_inflating_it():
     bomb = stream_of(bytes(10_000_000))
     header = {"lowest": [0], "bytes": [1]}
     with pytest.raises(InvalidInput, match="a bomb"):
@@ -94,18 +91,18 @@ def test_a_bomb_is_refused_without_inflating_it() -> None:
         decode_columns(header, bomb, (100, 1))
 
 
-def test_what_a_reader_would_take_for_a_bomb_is_not_written() -> None:
+def test_what_a_reader_would_take_for_a_bomb_is_not_written():
     with pytest.raises(InvalidInput, match="save it uncompressed"):
         encode_columns(np.zeros((5_000_000, 1), np.int32))
 
 
-def test_a_number_beyond_float32s_exact_range_is_refused() -> None:
+def test_a_number_beyond_float32s_exact_range_is_refused():
     header = {"lowest": [0], "bytes": [4]}
     with pytest.raises(InvalidInput, match="2\\^25 or more"):
         decode_columns(header, stream_of(b"\0\0\0\2"), (1, 1))
 
 
 @pytest.mark.parametrize("stream", [np.zeros((2, 2), np.uint8), np.zeros(4, np.float32)])
-def test_a_stream_is_a_row_of_bytes(stream: np.ndarray) -> None:
+def test_a_stream_is_a_row_of_bytes(stream):
     with pytest.raises(InvalidInput, match="not a row of bytes"):
         decode_columns({"lowest": [0], "bytes": [1]}, stream, (4, 1))

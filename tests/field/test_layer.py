@@ -1,8 +1,6 @@
 """A colour layer: what it adds, which base it is for, and that its id says so."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +19,7 @@ from rfcore.field.layer import (
 from rfcore.field.store import decode_field, encode_field
 from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import Gaussians
-
-Make = Callable[..., Gaussians]
+from tests.field.some import make_gaussians
 
 
 def empty_layer(gaussians: Gaussians, bands: int = 64) -> ColourLayer:
@@ -42,12 +39,12 @@ def layered(base: SplatField, layer: ColourLayer) -> SplatField:
     return layered_field(layer_archive(layer, base, base.metadata), base, base.metadata)
 
 
-def test_a_layer_of_zeros_changes_nothing(make_gaussians: Make) -> None:
+def test_a_layer_of_zeros_changes_nothing():
     gaussians = make_gaussians(40)
     assert (layered_colours(gaussians, empty_layer(gaussians)).sh == gaussians.sh).all()
 
 
-def test_a_voxel_moves_the_splats_in_it_and_no_other() -> None:
+def test_a_voxel_moves_the_splats_in_it_and_no_other():
     """Of two splats 1 m apart only the first, one luma step of 2 / 255."""
     arrays = {
         "means": [[0.1, 0.1, 0.1], [1.1, 0.1, 0.1]], "quaternions": [[1, 0, 0, 0]] * 2,
@@ -61,7 +58,7 @@ def test_a_voxel_moves_the_splats_in_it_and_no_other() -> None:
     assert (moved[1] == 0).all()
 
 
-def test_voxels_are_counted_in_the_order_of_their_corners() -> None:
+def test_voxels_are_counted_in_the_order_of_their_corners():
     means = np.array([[5, 0, 0], [-1, 0, 0], [5.1, 0, 0], [-1, 0, 3]], np.float32)
     voxel, count = voxels_of(means, 1.0)
     cells = np.unique(np.floor(means), axis=0, return_inverse=True)
@@ -70,7 +67,7 @@ def test_voxels_are_counted_in_the_order_of_their_corners() -> None:
     assert voxels_of(means[:0], 1.0)[1] == 0
 
 
-def test_base_and_layer_are_read_back_as_they_were(make_gaussians: Make, tmp_path: Path) -> None:
+def test_base_and_layer_are_read_back_as_they_were(tmp_path):
     base = SplatField(make_gaussians(60))
     made = layered(base, some_layer(base.gaussians))
     save_field(base, tmp_path / "noon.rff")
@@ -83,7 +80,7 @@ def test_base_and_layer_are_read_back_as_they_were(make_gaussians: Make, tmp_pat
     assert (again.gaussians.means == base.gaussians.means).all()
 
 
-def test_numbers_that_are_all_zero_take_no_bytes(make_gaussians: Make) -> None:
+def test_numbers_that_are_all_zero_take_no_bytes():
     base = SplatField(make_gaussians(3000))
     nothing = layered(base, empty_layer(base.gaussians))
     assert nothing.archive().arrays == {}
@@ -92,23 +89,21 @@ def test_numbers_that_are_all_zero_take_no_bytes(make_gaussians: Make) -> None:
     assert (again.gaussians.sh == base.gaussians.sh).all()
 
 
-def test_another_base_is_refused(make_gaussians: Make) -> None:
+def test_another_base_is_refused():
     base, other = SplatField(make_gaussians(20)), SplatField(make_gaussians(20, seed=1))
     archive = layer_archive(some_layer(base.gaussians), base, base.metadata)
     with pytest.raises(InvalidInput, match=r"layer.base: is for field"):
         layered_field(archive, other, other.metadata)
 
 
-def test_a_layer_on_a_layer_is_refused(make_gaussians: Make) -> None:
+def test_a_layer_on_a_layer_is_refused():
     base = SplatField(make_gaussians(20))
     once = layered(base, some_layer(base.gaussians))
     with pytest.raises(InvalidInput, match="is a layer itself"):
         layered(once, some_layer(base.gaussians))
 
 
-def test_a_layer_without_its_base_says_which_one_it_lacks(
-    make_gaussians: Make, tmp_path: Path
-) -> None:
+def test_a_layer_without_its_base_says_which_one_it_lacks(tmp_path):
     base = SplatField(make_gaussians(20))
     made = layered(base, some_layer(base.gaussians))
     save_field(made, tmp_path / "dusk.rff")
@@ -119,7 +114,7 @@ def test_a_layer_without_its_base_says_which_one_it_lacks(
     assert FieldStore(tmp_path / "store").ids() == ()
 
 
-def test_a_store_opens_a_layer_with_the_base_it_holds(make_gaussians: Make, tmp_path: Path) -> None:
+def test_a_store_opens_a_layer_with_the_base_it_holds(tmp_path):
     base = SplatField(make_gaussians(20))
     made = layered(base, some_layer(base.gaussians))
     store = FieldStore(tmp_path)
@@ -130,7 +125,7 @@ def test_a_store_opens_a_layer_with_the_base_it_holds(make_gaussians: Make, tmp_
     assert (loaded.gaussians.sh == made.gaussians.sh).all()
 
 
-def test_a_described_layer_stands_on_its_own(make_gaussians: Make) -> None:
+def test_a_described_layer_stands_on_its_own():
     base = SplatField(make_gaussians(20))
     made = layered(base, some_layer(base.gaussians))
     named = made.described(replace(made.metadata, name="dusk"))
@@ -151,9 +146,7 @@ def test_a_described_layer_stands_on_its_own(make_gaussians: Make) -> None:
         ),
     ],
 )
-def test_a_header_that_is_wrong_is_refused(
-    make_gaussians: Make, change: dict[str, object], message: str
-) -> None:
+def test_a_header_that_is_wrong_is_refused(change, message):
     base = SplatField(make_gaussians(20))
     archive = layer_archive(some_layer(base.gaussians), base, base.metadata)
     wrong = Archive(archive.kind, {**archive.metadata, **change}, archive.arrays)
@@ -161,9 +154,7 @@ def test_a_header_that_is_wrong_is_refused(
         decode_field(encode_archive(wrong), open_base=lambda _: base)
 
 
-def test_counts_beyond_the_splats_are_refused_before_anything_is_made(
-    make_gaussians: Make,
-) -> None:
+def test_counts_beyond_the_splats_are_refused_before_anything_is_made():
     base = SplatField(make_gaussians(20))
     archive = layer_archive(some_layer(base.gaussians), base, base.metadata)
     encoding = archive.metadata["encoding"]

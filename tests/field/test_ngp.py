@@ -1,7 +1,6 @@
 """Hash grid fields: their files give them back, and damaged ones are refused by name."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ def camera() -> Camera:
     return Camera(Intrinsics(19, 11, 12.0, 12.0, 9.5, 5.5), Pose((1, 2, 2.5), (1.0, 0, 0, 0)))
 
 
-def test_a_saved_field_is_read_back_whole(field: NgpField, camera: Camera, tmp_path: Path) -> None:
+def test_a_saved_field_is_read_back_whole(field, camera, tmp_path):
     field_id = save_field(field, tmp_path / "a.rff")
     read = load_field(tmp_path / "a.rff", threads=2)
     assert isinstance(read, NgpField)
@@ -46,7 +45,7 @@ def test_a_saved_field_is_read_back_whole(field: NgpField, camera: Camera, tmp_p
     assert read.render_colour(camera).tobytes() == field.render_colour(camera).tobytes()
 
 
-def test_a_field_with_other_threads_shares_the_numbers(field: NgpField, camera: Camera) -> None:
+def test_a_field_with_other_threads_shares_the_numbers(field, camera):
     field.prepare()
     own = field.with_threads(2)
     assert own.numbers is field.numbers
@@ -56,15 +55,13 @@ def test_a_field_with_other_threads_shares_the_numbers(field: NgpField, camera: 
     assert own.render_colour(camera).tobytes() == field.render_colour(camera).tobytes()
 
 
-def test_the_field_is_what_its_file_can_hold(field: NgpField) -> None:
+def test_the_field_is_what_its_file_can_hold(field):
     table = field.numbers.table
     assert np.array_equal(table, table.astype(np.float16).astype(np.float32))
     assert field.primitives == table.size + field.numbers.matrices.size
 
 
-def test_samples_per_ray_is_the_knob_and_the_others_do_nothing(
-    field: NgpField, camera: Camera
-) -> None:
+def test_samples_per_ray_is_the_knob_and_the_others_do_nothing(field, camera):
     full = field.render(camera)
     assert full.colour.tobytes() == field.render_colour(camera).tobytes()
     other = field.render_colour(camera, Quality(detail=0.1, sh_degree=0))
@@ -74,7 +71,7 @@ def test_samples_per_ray_is_the_knob_and_the_others_do_nothing(
     assert full.confidence.shape == (11, 19)
 
 
-def test_metadata_of_splats_is_refused(field: NgpField) -> None:
+def test_metadata_of_splats_is_refused(field):
     with pytest.raises(InvalidInput, match=r"field\.kind: 'splats'"):
         NgpField(field.numbers, FieldMetadata())
 
@@ -119,9 +116,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("change", "named"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_file_that_makes_no_sense_is_refused_by_name(
-    field: NgpField, change: Change, named: str
-) -> None:
+def test_a_file_that_makes_no_sense_is_refused_by_name(field, change, named):
     archive = decode_archive(encode_field(field))
     header, arrays = dict(archive.metadata), dict(archive.arrays)
     header["ngp"] = dict(header["ngp"])
@@ -132,7 +127,7 @@ def test_a_file_that_makes_no_sense_is_refused_by_name(
     assert "street.rff" in str(refused.value)
 
 
-def test_a_grid_takes_no_more_memory_than_it_may(field: NgpField) -> None:
+def test_a_grid_takes_no_more_memory_than_it_may(field):
     data, arrays = encode_field(field), field.archive().arrays
     occupancy_words = 20 * 10 * 5 // 32 + 1
     taken_bytes = 4 * (arrays["table"].size + arrays["matrices"].size + occupancy_words)

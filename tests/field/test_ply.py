@@ -15,6 +15,7 @@ from rfcore.field import ply_table
 from rfcore.field.ply_table import read_vertices, write_vertices
 from rfcore.field.splat_file import read_splat_file, write_ply
 from rfcore.raster.gaussians import Gaussians
+from tests.field.some import make_gaussians
 
 NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
@@ -30,20 +31,17 @@ def assert_equal(a: Gaussians, b: Gaussians) -> None:
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 7])
-def test_gaussians_survive_a_ply(make_gaussians, tmp_path: Path, n: int, sh_degree: int) -> None:
+def test_gaussians_survive_a_ply(tmp_path, n, sh_degree):
     gaussians = make_gaussians(n, sh_degree)
     write_ply(tmp_path / "a.ply", gaussians)
     assert_equal(read_ply(tmp_path / "a.ply"), gaussians)
 
 
-def test_the_columns_are_those_of_the_reference_implementation(
-    make_gaussians, tmp_path: Path
-) -> None:
+def test_the_columns_are_those_of_the_reference_implementation(tmp_path):
     gaussians = make_gaussians(3, 3)
     write_ply(tmp_path / "a.ply", gaussians)
     table = read_vertices(tmp_path / "a.ply", ())
     names = table.dtype.names
-    assert names is not None
     assert names[:9] == ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
     assert names[9:54] == tuple(f"f_rest_{i}" for i in range(45))
     assert names[54:] == (
@@ -58,14 +56,12 @@ def test_the_columns_are_those_of_the_reference_implementation(
 
 
 @given(st.permutations(range(17)), st.sampled_from(["<f4", "<f8"]))
-def test_order_type_and_further_properties_do_not_matter(
-    make_gaussians, tmp_path_factory, order: list[int], dtype: str
-) -> None:
+def test_order_type_and_further_properties_do_not_matter(tmp_path_factory, order, dtype):
     directory = tmp_path_factory.mktemp("ply")
     gaussians = make_gaussians(4, 0)
     write_ply(directory / "a.ply", gaussians)
     table = read_vertices(directory / "a.ply", ())
-    names = [table.dtype.names[i] for i in order]  # type: ignore[index]
+    names = [table.dtype.names[i] for i in order]
     names = [name for name in names if name not in ("nx", "ny", "nz")] + ["label"]
     other = np.zeros(len(table), [(name, "u1" if name == "label" else dtype) for name in names])
     for name in names[:-1]:
@@ -78,7 +74,7 @@ def test_order_type_and_further_properties_do_not_matter(
     assert_equal(read_ply(directory / "b.ply"), gaussians)
 
 
-def test_the_tile_origin_is_taken_off_in_float64(make_gaussians, tmp_path: Path) -> None:
+def test_the_tile_origin_is_taken_off_in_float64(tmp_path):
     gaussians = make_gaussians(2, 0)
     write_ply(tmp_path / "a.ply", gaussians)
     moved = read_ply(tmp_path / "a.ply", TileOrigin(1.0, 2.0, 3.0))
@@ -112,9 +108,7 @@ def edited(path: Path, old: str, new: str) -> None:
         ("property float f_rest_44", "property float other", "44 f_rest properties"),
     ],
 )
-def test_a_header_that_cannot_be_read_is_refused_by_name(
-    make_gaussians, tmp_path: Path, old: str, new: str, named: str
-) -> None:
+def test_a_header_that_cannot_be_read_is_refused_by_name(tmp_path, old, new, named):
     file = tmp_path / "a.ply"
     write_ply(file, make_gaussians(4, 3))
     edited(file, old, new)
@@ -123,7 +117,7 @@ def test_a_header_that_cannot_be_read_is_refused_by_name(
     assert "a.ply" in str(caught.value)
 
 
-def test_every_truncation_is_refused(make_gaussians, tmp_path: Path) -> None:
+def test_every_truncation_is_refused(tmp_path):
     file = tmp_path / "a.ply"
     write_ply(file, make_gaussians(2, 0))
     data = file.read_bytes()
@@ -134,7 +128,7 @@ def test_every_truncation_is_refused(make_gaussians, tmp_path: Path) -> None:
 
 
 @given(st.binary(max_size=200))
-def test_noise_is_refused(tmp_path_factory, noise: bytes) -> None:
+def test_noise_is_refused(tmp_path_factory, noise):
     file = tmp_path_factory.mktemp("ply") / "noise.ply"
     for data in (noise, b"ply\nformat binary_little_endian 1.0\n" + noise):
         file.write_bytes(data)
@@ -143,7 +137,7 @@ def test_noise_is_refused(tmp_path_factory, noise: bytes) -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
-def test_values_that_are_not_finite_are_refused(make_gaussians, tmp_path: Path, bad: float) -> None:
+def test_values_that_are_not_finite_are_refused(tmp_path, bad):
     write_ply(tmp_path / "a.ply", make_gaussians(3, 0))
     table = read_vertices(tmp_path / "a.ply", ())
     names = table.dtype.names or ()
@@ -157,7 +151,7 @@ def test_values_that_are_not_finite_are_refused(make_gaussians, tmp_path: Path, 
         read_ply(tmp_path / "a.ply")
 
 
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(FieldFormatError, match=r"none\.ply: cannot be read"):
         read_ply(tmp_path / "none.ply")
 
@@ -172,16 +166,14 @@ def as_text(path: Path, out: Path, digits: int = 9) -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 5000])
-def test_text_gives_back_the_values_it_was_written_from(
-    make_gaussians, tmp_path: Path, n: int
-) -> None:
+def test_text_gives_back_the_values_it_was_written_from(tmp_path, n):
     gaussians = make_gaussians(n, 0)
     write_ply(tmp_path / "a.ply", gaussians)
     as_text(tmp_path / "a.ply", tmp_path / "b.ply")
     assert_equal(read_ply(tmp_path / "b.ply"), gaussians)
 
 
-def test_big_endian_rows_give_the_same_values(make_gaussians, tmp_path: Path) -> None:
+def test_big_endian_rows_give_the_same_values(tmp_path):
     gaussians = make_gaussians(6, 1)
     write_ply(tmp_path / "a.ply", gaussians)
     table = read_vertices(tmp_path / "a.ply", ())
@@ -192,7 +184,7 @@ def test_big_endian_rows_give_the_same_values(make_gaussians, tmp_path: Path) ->
     assert_equal(read_ply(tmp_path / "b.ply"), gaussians)
 
 
-def test_every_truncated_text_is_refused(make_gaussians, tmp_path: Path) -> None:
+def test_every_truncated_text_is_refused(tmp_path):
     """But for the last digits of the last number, which nobody can miss."""
     write_ply(tmp_path / "a.ply", make_gaussians(2, 0))
     as_text(tmp_path / "a.ply", tmp_path / "b.ply")
@@ -214,9 +206,7 @@ def test_every_truncated_text_is_refused(make_gaussians, tmp_path: Path) -> None
         (b"\n0.125730217", b"\nnan", "means: 1 of 3 .* number 0"),
     ],
 )
-def test_text_that_is_not_rows_of_numbers_is_refused_by_name(
-    make_gaussians, tmp_path: Path, old: bytes, new: bytes, named: str
-) -> None:
+def test_text_that_is_not_rows_of_numbers_is_refused_by_name(tmp_path, old, new, named):
     write_ply(tmp_path / "a.ply", make_gaussians(3, 0))
     as_text(tmp_path / "a.ply", tmp_path / "b.ply")
     data = (tmp_path / "b.ply").read_bytes()
@@ -237,24 +227,20 @@ def test_text_that_is_not_rows_of_numbers_is_refused_by_name(
         ("a.gltf", r"export the splats as \.ply"),
     ],
 )
-def test_other_formats_are_refused_with_what_converts_them(
-    tmp_path: Path, name: str, advice: str
-) -> None:
+def test_other_formats_are_refused_with_what_converts_them(tmp_path, name, advice):
     with pytest.raises(FieldFormatError, match=advice):
         read_ply(tmp_path / name)
 
 
 @pytest.mark.parametrize("antialiased", [True, False, None])
-def test_how_splats_are_drawn_survives_a_ply_and_changes_no_splat(
-    make_gaussians, tmp_path: Path, antialiased: bool | None
-) -> None:
+def test_how_splats_are_drawn_survives_a_ply_and_changes_no_splat(tmp_path, antialiased):
     gaussians = make_gaussians(3, 1)
     write_ply(tmp_path / "a.ply", gaussians, antialiased=antialiased)
     assert read_splat_file(tmp_path / "a.ply")[1] is antialiased
     assert_equal(read_ply(tmp_path / "a.ply"), gaussians)
 
 
-def test_the_comment_is_spelled_as_other_tools_read_it(make_gaussians, tmp_path: Path) -> None:
+def test_the_comment_is_spelled_as_other_tools_read_it(tmp_path):
     for antialiased, line in ((True, b"mip"), (False, b"default")):
         write_ply(tmp_path / "a.ply", make_gaussians(1, 0), antialiased=antialiased)
         header = (tmp_path / "a.ply").read_bytes().split(b"\n")
@@ -275,16 +261,14 @@ def test_the_comment_is_spelled_as_other_tools_read_it(make_gaussians, tmp_path:
         ([], None),
     ],
 )
-def test_every_spelling_in_use_is_read_and_the_last_counts(
-    make_gaussians, tmp_path: Path, comments: list[str], stated: bool | None
-) -> None:
+def test_every_spelling_in_use_is_read_and_the_last_counts(tmp_path, comments, stated):
     write_ply(tmp_path / "a.ply", make_gaussians(1, 0))
     lines = "".join(f"comment {text}\n" for text in comments)
     edited(tmp_path / "a.ply", "element vertex", f"{lines}element vertex")
     assert read_splat_file(tmp_path / "a.ply")[1] is stated
 
 
-def test_a_mode_there_is_not_is_refused_by_name(make_gaussians, tmp_path: Path) -> None:
+def test_a_mode_there_is_not_is_refused_by_name(tmp_path):
     write_ply(tmp_path / "a.ply", make_gaussians(1, 0), antialiased=True)
     edited(tmp_path / "a.ply", "SplatRenderMode: mip", "SplatRenderMode: 2dgs")
     with pytest.raises(FieldFormatError, match="'SplatRenderMode: 2dgs' names neither mode"):
@@ -292,7 +276,7 @@ def test_a_mode_there_is_not_is_refused_by_name(make_gaussians, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
-def test_a_count_that_lies_allocates_nothing(make_gaussians, tmp_path: Path, form: str) -> None:
+def test_a_count_that_lies_allocates_nothing(tmp_path, form):
     file = tmp_path / "a.ply"
     write_ply(file, make_gaussians(4, 3))
     edited(file, "binary_little_endian", form)
@@ -306,7 +290,7 @@ def test_a_count_that_lies_allocates_nothing(make_gaussians, tmp_path: Path, for
         tracemalloc.stop()
 
 
-def test_a_sparse_file_of_a_terabyte_is_one_error(make_gaussians, tmp_path: Path) -> None:
+def test_a_sparse_file_of_a_terabyte_is_one_error(tmp_path):
     write_ply(tmp_path / "a.ply", make_gaussians(3, 3))
     header, end, _ = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     (tmp_path / "a.ply").write_bytes(header.replace(b"vertex 3", b"vertex 4000000000") + end)
@@ -317,7 +301,7 @@ def test_a_sparse_file_of_a_terabyte_is_one_error(make_gaussians, tmp_path: Path
         read_vertices(tmp_path / "a.ply", ())
 
 
-def test_a_terminal_is_told_nothing_by_a_header(tmp_path: Path) -> None:
+def test_a_terminal_is_told_nothing_by_a_header(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"ply\nformat \x1b]0;owned\x07 1.0\nend_header\n")
     with pytest.raises(FieldFormatError) as refused:
         read_ply(tmp_path / "a.ply")
@@ -325,16 +309,14 @@ def test_a_terminal_is_told_nothing_by_a_header(tmp_path: Path) -> None:
     assert str(refused.value).isprintable()
 
 
-def test_splats_beyond_the_memory_they_may_take_are_refused(make_gaussians, tmp_path: Path) -> None:
+def test_splats_beyond_the_memory_they_may_take_are_refused(tmp_path):
     write_ply(tmp_path / "a.ply", make_gaussians(3, 0))
     assert_equal(read_ply(tmp_path / "a.ply", max_bytes=3 * 56), make_gaussians(3, 0))
     with pytest.raises(FieldFormatError, match="raise it"):
         read_ply(tmp_path / "a.ply", max_bytes=3 * 56 - 1)
 
 
-def test_parts_of_a_file_make_the_whole(
-    make_gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parts_of_a_file_make_the_whole(tmp_path, monkeypatch):
     gaussians = make_gaussians(10, 1)
     write_ply(tmp_path / "a.ply", gaussians)
     as_text(tmp_path / "a.ply", tmp_path / "b.ply")

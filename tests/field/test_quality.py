@@ -1,7 +1,5 @@
 """A quality is on the ladder or refused, and draws what its level is defined to draw."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,33 +9,32 @@ from rfcore.field import FULL, Quality, SplatField, load_field, save_field
 from rfcore.field.quality import DETAILS, LevelOfDetail, kept_of, splats_at_detail
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
+from tests.field.some import make_gaussians
 
 CAMERA = Camera(Intrinsics(30, 20, 20.0, 20.0, 15.0, 10.0), Pose((0, 0, -4), (1, 0, 0, 0)))
 
 
 @pytest.mark.parametrize("detail", [0, -1.0, 0.3, 1.5, float("nan")])
-def test_a_share_between_two_levels_is_refused(detail: float) -> None:
+def test_a_share_between_two_levels_is_refused(detail):
     with pytest.raises(InvalidInput, match=r"quality\.detail: .*none of 1, 0\.5, 0\.25, 0\.1"):
         Quality(detail=detail)
 
 
 @pytest.mark.parametrize("knob", [{"sh_degree": 4}, {"sh_degree": -1}, {"samples_per_ray": 0}])
-def test_a_knob_out_of_range_is_refused_by_name(knob: dict[str, int]) -> None:
+def test_a_knob_out_of_range_is_refused_by_name(knob):
     with pytest.raises(InvalidInput, match=f"quality.{next(iter(knob))}"):
         Quality(**knob)
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 9, 10, 11, 150_000, 10**7 + 3])
-def test_a_level_holds_its_share_rounded_up(count: int) -> None:
+def test_a_level_holds_its_share_rounded_up(count):
     kept = [kept_of(count, detail) for detail in DETAILS]
     assert kept == [count, -(-count // 2), -(-count // 4), -(-count // 10)]
 
 
 @pytest.mark.parametrize("detail", DETAILS)
 @pytest.mark.parametrize("sh_degree", [None, 3, 2, 1, 0])
-def test_a_field_draws_the_first_splats_with_the_first_bands(
-    make_gaussians, detail: float, sh_degree: int | None
-) -> None:
+def test_a_field_draws_the_first_splats_with_the_first_bands(detail, sh_degree):
     g = make_gaussians(41, 2)
     kept, bands = kept_of(41, detail), (min(2 if sh_degree is None else sh_degree, 2) + 1) ** 2
     parts = (g.means, g.quaternions, g.log_scales, g.opacity_logits)
@@ -52,22 +49,13 @@ def test_a_field_draws_the_first_splats_with_the_first_bands(
     np.testing.assert_array_equal(colour, want.colour)
 
 
-def test_everything_is_drawn_unless_less_is_asked_for(make_gaussians) -> None:
+def test_everything_is_drawn_unless_less_is_asked_for():
     field = SplatField(make_gaussians(20))
     assert splats_at_detail(field.gaussians, {}, 1.0) is field.gaussians, "and nothing is copied"
     assert field.render_colour(CAMERA).tobytes() == field.render_colour(CAMERA, FULL).tobytes()
 
 
-def test_the_renderer_of_a_level_is_made_once_and_only_when_asked_for(make_gaussians) -> None:
-    field = SplatField(make_gaussians(20, 1))
-    half = field.rasterizer(0.5)
-    assert field.rasterizer(0.5) is half
-    assert field.rasterizer() is not half
-
-
-def test_a_level_with_scales_and_opacities_of_its_own_is_drawn_with_them(
-    make_gaussians, tmp_path: Path
-) -> None:
+def test_a_level_with_scales_and_opacities_of_its_own_is_drawn_with_them(tmp_path):
     g, other = make_gaussians(21, 1), make_gaussians(11, 1, seed=1)
     own = LevelOfDetail(other.log_scales, other.opacity_logits)
     save_field(SplatField(g, levels={0.5: own}), tmp_path / "a.rff")
@@ -88,9 +76,7 @@ def test_a_level_with_scales_and_opacities_of_its_own_is_drawn_with_them(
         (1.0, 21, 0.0, r"1\.0 is none of \(0\.5, 0\.25, 0\.1\)"),
     ],
 )
-def test_a_level_that_does_not_fit_is_refused_by_name(
-    make_gaussians, detail: float, count: int, value: float, named: str
-) -> None:
+def test_a_level_that_does_not_fit_is_refused_by_name(detail, count, value, named):
     own = LevelOfDetail(np.full((count, 3), value, np.float32), np.full(count, value, np.float32))
     with pytest.raises(InvalidInput, match=named):
         SplatField(make_gaussians(21), levels={detail: own})

@@ -8,6 +8,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import Quality, SplatField
 from rfcore.field.quality import colour_at_scale, view_at_scale
 from rfcore.views import View
+from tests.field.some import make_gaussians
 
 HALF = Quality(scale=0.5)
 
@@ -27,7 +28,7 @@ def slope(seen: Camera, _quality: Quality) -> View:
 
 
 @pytest.mark.parametrize("size_px", [(16, 12), (15, 11), (2, 2)])
-def test_a_slope_is_enlarged_to_itself_away_from_the_edge(size_px: tuple[int, int]) -> None:
+def test_a_slope_is_enlarged_to_itself_away_from_the_edge(size_px):
     full = slope(camera(*size_px), Quality())
     enlarged = view_at_scale(slope, camera(*size_px), HALF)
     inner = (slice(1, -1), slice(1, -1))
@@ -35,7 +36,7 @@ def test_a_slope_is_enlarged_to_itself_away_from_the_edge(size_px: tuple[int, in
     np.testing.assert_array_equal(enlarged.opacity, full.opacity)
 
 
-def test_depth_is_that_of_one_surface_never_a_mean() -> None:
+def test_depth_is_that_of_one_surface_never_a_mean():
     small = slope(camera(16, 12), Quality())
     enlarged = view_at_scale(slope, camera(16, 12), HALF)
     assert enlarged.depth.shape == small.depth.shape
@@ -43,9 +44,7 @@ def test_depth_is_that_of_one_surface_never_a_mean() -> None:
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (2, 3), (31, 20), (30, 21)])
-def test_colour_alone_is_the_colour_of_the_view_at_any_size(
-    make_gaussians, size_px: tuple[int, int]
-) -> None:
+def test_colour_alone_is_the_colour_of_the_view_at_any_size(size_px):
     field, seen = SplatField(make_gaussians(30, 1)), camera(*size_px)
     view = field.render(seen, HALF)
     width, height = size_px
@@ -56,12 +55,12 @@ def test_colour_alone_is_the_colour_of_the_view_at_any_size(
     assert view.depth.flags.c_contiguous
 
 
-def test_at_full_scale_nothing_is_touched() -> None:
+def test_at_full_scale_nothing_is_touched():
     view = slope(camera(4, 4), Quality())
     assert view_at_scale(lambda *_: view, camera(4, 4), Quality()) is view
     assert colour_at_scale(lambda *_: view.colour, camera(4, 4), Quality()) is view.colour
 
 
-def test_other_scales_are_refused() -> None:
+def test_other_scales_are_refused():
     with pytest.raises(InvalidInput, match=r"quality\.scale: 0\.25 is neither 1 nor 0\.5"):
         Quality(scale=0.25)

@@ -1,7 +1,6 @@
 """A field moved with its camera shows the same picture; nerfstudio's normalisation is undone."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field.similarity import Similarity, moved, read_field_from_world, spherical_harmonics
 from rfcore.raster import reference
 from rfcore.raster.native import Rasterizer
+from tests.field.some import make_gaussians
 
 INTRINSICS = Intrinsics(40, 30, 35.0, 35.0, 20.0, 15.0)
 numbers = st.floats(-1, 1, width=32)
@@ -31,7 +31,7 @@ def similarities(draw: st.DrawFn) -> Similarity:
     return Similarity(Pose(shift, unit(q)), draw(st.floats(0.05, 20)))
 
 
-def test_the_basis_is_the_rasterizers() -> None:
+def test_the_basis_is_the_rasterizers():
     directions = np.random.default_rng(0).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     want = reference.spherical_harmonics(torch.from_numpy(directions), 3).numpy()
@@ -39,9 +39,7 @@ def test_the_basis_is_the_rasterizers() -> None:
 
 
 @given(similarities())
-def test_a_field_moved_with_its_camera_shows_the_same_picture(
-    make_gaussians, move: Similarity
-) -> None:
+def test_a_field_moved_with_its_camera_shows_the_same_picture(move):
     """Tolerance: float32 means and widths, through a camera at another scale."""
     g = make_gaussians(25, 3)
     here = Camera(INTRINSICS, Pose((0.5, 0.2, -4), unit((1, 0.1, -0.05, 0.02))))
@@ -55,13 +53,13 @@ def test_a_field_moved_with_its_camera_shows_the_same_picture(
 
 
 @given(similarities(), similarities())
-def test_moves_compose_and_invert_as_their_points_do(a: Similarity, b: Similarity) -> None:
+def test_moves_compose_and_invert_as_their_points_do(a, b):
     points = np.random.default_rng(1).normal(size=(5, 3))
     np.testing.assert_allclose(a.compose(b).apply(points), a.apply(b.apply(points)), atol=1e-9)
     np.testing.assert_allclose(a.inverse().apply(a.apply(points)), points, atol=1e-9)
 
 
-def test_nerfstudios_frame_is_its_transform_then_its_scale(tmp_path: Path) -> None:
+def test_nerfstudios_frame_is_its_transform_then_its_scale(tmp_path):
     file = tmp_path / "dataparser_transforms.json"
     transform = [[0, 1, 0, 10], [-1, 0, 0, 20], [0, 0, 1, 30]]
     file.write_text(json.dumps({"transform": transform, "scale": 0.1}))
@@ -83,19 +81,19 @@ def test_nerfstudios_frame_is_its_transform_then_its_scale(tmp_path: Path) -> No
         ('{"transform": [[1,0,0,0]], "scale": 1}', "must be 3x4"),
     ],
 )
-def test_a_transform_that_is_none_is_refused_by_name(tmp_path: Path, text: str, named: str) -> None:
+def test_a_transform_that_is_none_is_refused_by_name(tmp_path, text, named):
     file = tmp_path / "dataparser_transforms.json"
     file.write_text(text)
     with pytest.raises(FieldFormatError, match=f"dataparser_transforms.json: .*({named})"):
         read_field_from_world(file)
 
 
-def test_a_missing_transform_file_is_refused(tmp_path: Path) -> None:
+def test_a_missing_transform_file_is_refused(tmp_path):
     with pytest.raises(FieldFormatError, match="cannot be read"):
         read_field_from_world(tmp_path / "none.json")
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_scale_that_is_none_is_refused(scale: float) -> None:
+def test_a_scale_that_is_none_is_refused(scale):
     with pytest.raises(InvalidInput, match=r"transform\.scale"):
         Similarity(Pose.identity(), scale)

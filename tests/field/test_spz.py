@@ -45,7 +45,7 @@ def rotation(packed: int) -> np.ndarray:
 
 
 @given(st.integers(0, 2**31), st.integers(0, 3), st.sampled_from([0.5, 40.0, 3000.0, 2e5]))
-def test_each_attribute_keeps_its_precision(seed: int, degree: int, reach_m: float) -> None:
+def test_each_attribute_keeps_its_precision(seed, degree, reach_m):
     given_ = random_gaussians(seed, 17, degree, reach_m)
     data = gzip.decompress(encode_spz(given_, antialiased=True))
     magic, version, n, sh_degree, fraction_bits, flags, _ = HEADER.unpack_from(data)
@@ -76,17 +76,17 @@ def test_each_attribute_keeps_its_precision(seed: int, degree: int, reach_m: flo
         assert (np.abs((sh.astype(int) - 128) - bands * 128) <= steps / 2 + 1).all()
 
 
-def test_no_splats_are_a_file_too() -> None:
+def test_no_splats_are_a_file_too():
     data = gzip.decompress(encode_spz(random_gaussians(1, 0, 0, 1.0), antialiased=False))
     assert HEADER.unpack(data)[2:6] == (0, 0, 12, 0)
 
 
-def test_the_same_splats_give_the_same_bytes() -> None:
+def test_the_same_splats_give_the_same_bytes():
     one, other = (encode_spz(random_gaussians(3, 50, 3, 9.0), antialiased=True) for _ in range(2))
     assert one == other
 
 
-def test_the_sky_is_written_nearby_as_wide_to_the_eye_and_the_street_as_finely_as_ever() -> None:
+def test_the_sky_is_written_nearby_as_wide_to_the_eye_and_the_street_as_finely_as_ever():
     street = random_gaussians(1, 40, 0, 60.0)
     street.means[::5] *= 1e5 / np.linalg.norm(street.means[::5], axis=1, keepdims=True)
     street.log_scales[::5] = 6.8
@@ -99,7 +99,7 @@ def test_the_sky_is_written_nearby_as_wide_to_the_eye_and_the_street_as_finely_a
     assert read.log_scales[is_sky] == pytest.approx(6.8 - np.log(50), abs=0.05)
 
 
-def test_a_splat_beyond_24_bits_of_metres_is_refused() -> None:
+def test_a_splat_beyond_24_bits_of_metres_is_refused():
     with pytest.raises(InvalidInput, match=r"means: .* reaches 8388607 m"):
         encode_spz(random_gaussians(3, 9, 0, 3e7), antialiased=False)
 
@@ -132,7 +132,7 @@ def assert_same(one: Gaussians, other: Gaussians) -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(0, 3), st.sampled_from([0.5, 40.0, 3000.0]))
-def test_what_is_written_is_read_within_its_steps(seed: int, degree: int, reach_m: float) -> None:
+def test_what_is_written_is_read_within_its_steps(seed, degree, reach_m):
     given_ = random_gaussians(seed, 17, degree, reach_m)
     read, antialiased = decoded(encode_spz(given_, antialiased=seed % 2 == 0))
     assert antialiased == (seed % 2 == 0)
@@ -147,13 +147,13 @@ def test_what_is_written_is_read_within_its_steps(seed: int, degree: int, reach_
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_a_file_without_splats_is_read(degree: int) -> None:
+def test_a_file_without_splats_is_read(degree):
     empty, _ = decoded(encode_spz(random_gaussians(1, 0, degree, 1.0), antialiased=False))
     assert empty.sh.shape == (0, (degree + 1) ** 2, 3)
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_reading_is_exact_once_the_splats_are_in_steps(degree: int) -> None:
+def test_reading_is_exact_once_the_splats_are_in_steps(degree):
     once, antialiased = decoded(encode_spz(random_gaussians(5, 40, degree, 9.0), antialiased=True))
     twice, _ = decoded(encode_spz(once, antialiased=antialiased))
     np.testing.assert_allclose(twice.means, once.means, atol=0)
@@ -162,12 +162,12 @@ def test_reading_is_exact_once_the_splats_are_in_steps(degree: int) -> None:
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_version_4_holds_the_same_splats(degree: int) -> None:
+def test_version_4_holds_the_same_splats(degree):
     data = encode_spz(random_gaussians(6, 40, degree, 9.0), antialiased=True)
     assert_same(decoded(as_version_4(data))[0], decoded(data)[0])
 
 
-def test_version_2_has_rotations_of_three_bytes() -> None:
+def test_version_2_has_rotations_of_three_bytes():
     given_ = random_gaussians(7, 30, 1, 9.0)
     plain = bytearray(gzip.decompress(encode_spz(given_, antialiased=False)))
     plain[4] = 2
@@ -179,7 +179,7 @@ def test_version_2_has_rotations_of_three_bytes() -> None:
     assert (np.abs((read.quaternions * turns).sum(axis=1)) > 0.999).all()
 
 
-def test_the_tiles_origin_is_taken_off_before_float32() -> None:
+def test_the_tiles_origin_is_taken_off_before_float32():
     data = encode_spz(random_gaussians(8, 20, 0, 4000.0), antialiased=False)
     moved, _ = read_open_spz(NAME, io.BytesIO(data), TileOrigin(100.0, 200.0, 3.0), 1 << 20)
     here, _ = decoded(data)
@@ -215,7 +215,7 @@ def edited(at: int, value: int) -> Callable[[bytes], bytes]:
         (lambda data: as_version_4(data)[:32] + b"\xff" * 200, "stream of"),
     ],
 )
-def test_what_is_no_whole_spz_is_refused_by_name(edit, named: str) -> None:
+def test_what_is_no_whole_spz_is_refused_by_name(edit, named):
     data = encode_spz(random_gaussians(9, 20, 1, 9.0), antialiased=False)
     with pytest.raises(FieldFormatError, match=named):
         decoded(edit(data))

@@ -2,16 +2,16 @@
 
 import os
 from functools import partial
-from pathlib import Path
 
 import pytest
 
 from rfcore.errors import FieldFormatError, UnknownField
 from rfcore.field import FieldStore, SplatField, save_field
 from rfcore.field.store import decode_field, encode_field, load_checked, load_field
+from tests.field.some import make_gaussians
 
 
-def test_an_added_field_is_listed_found_and_loaded(make_gaussians, tmp_path: Path) -> None:
+def test_an_added_field_is_listed_found_and_loaded(tmp_path):
     store = FieldStore(tmp_path / "fields")
     assert store.ids() == ()
     field = SplatField(make_gaussians())
@@ -21,7 +21,7 @@ def test_an_added_field_is_listed_found_and_loaded(make_gaussians, tmp_path: Pat
     assert store.load(field.field_id).field_id == field.field_id
 
 
-def test_a_file_may_be_added_under_its_expected_id(make_gaussians, tmp_path: Path) -> None:
+def test_a_file_may_be_added_under_its_expected_id(tmp_path):
     field_id = save_field(SplatField(make_gaussians()), tmp_path / "street.rff")
     store = FieldStore(tmp_path / "fields")
     assert store.add(tmp_path / "street.rff", field_id) == field_id
@@ -29,7 +29,7 @@ def test_a_file_may_be_added_under_its_expected_id(make_gaussians, tmp_path: Pat
     assert store.ids() == (field_id,)
 
 
-def test_a_file_of_any_name_is_found_by_its_content(make_gaussians, tmp_path: Path) -> None:
+def test_a_file_of_any_name_is_found_by_its_content(tmp_path):
     field_id = save_field(SplatField(make_gaussians()), tmp_path / "street.rff")
     store = FieldStore(tmp_path)
     assert store.path(field_id) == tmp_path / "street.rff"
@@ -38,9 +38,7 @@ def test_a_file_of_any_name_is_found_by_its_content(make_gaussians, tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ["0" * 64, "../secret", "", "nonsense"])
-def test_an_unknown_id_names_itself_and_what_is_here(
-    make_gaussians, tmp_path: Path, name: str
-) -> None:
+def test_an_unknown_id_names_itself_and_what_is_here(tmp_path, name):
     store = FieldStore(tmp_path)
     with pytest.raises(UnknownField, match="holds nothing"):
         store.path(name)
@@ -50,7 +48,7 @@ def test_an_unknown_id_names_itself_and_what_is_here(
     assert repr(name) in str(caught.value)
 
 
-def test_a_compressed_field_is_kept_as_it_came(make_gaussians, tmp_path: Path) -> None:
+def test_a_compressed_field_is_kept_as_it_came(tmp_path):
     store = FieldStore(tmp_path)
     field = SplatField(make_gaussians(30)).compressed()
     data = encode_field(field)
@@ -59,7 +57,7 @@ def test_a_compressed_field_is_kept_as_it_came(make_gaussians, tmp_path: Path) -
     assert store.load(field.field_id, threads=2).field_id == field.field_id
 
 
-def test_damaged_bytes_are_not_added(make_gaussians, tmp_path: Path) -> None:
+def test_damaged_bytes_are_not_added(tmp_path):
     store = FieldStore(tmp_path)
     field = SplatField(make_gaussians())
     data = bytearray(encode_field(field))
@@ -71,7 +69,7 @@ def test_damaged_bytes_are_not_added(make_gaussians, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_field_damaged_in_the_store_is_refused(make_gaussians, tmp_path: Path) -> None:
+def test_a_field_damaged_in_the_store_is_refused(tmp_path):
     store = FieldStore(tmp_path)
     field_id = store.add(encode_field(SplatField(make_gaussians())))
     path = store.path(field_id)
@@ -80,7 +78,7 @@ def test_a_field_damaged_in_the_store_is_refused(make_gaussians, tmp_path: Path)
         store.load(field_id)
 
 
-def test_a_file_longer_than_its_field_may_be_is_refused_unread(tmp_path: Path) -> None:
+def test_a_file_longer_than_its_field_may_be_is_refused_unread(tmp_path):
     long, field_id = tmp_path / "long.rff", "0" * 64
     with long.open("wb") as file:
         file.truncate(1 << 40)
@@ -89,13 +87,13 @@ def test_a_file_longer_than_its_field_may_be_is_refused_unread(tmp_path: Path) -
             load(long, max_bytes=10**7)
 
 
-def test_a_pipe_is_refused_and_hangs_nobody(tmp_path: Path) -> None:
+def test_a_pipe_is_refused_and_hangs_nobody(tmp_path):
     os.mkfifo(tmp_path / "pipe.rff")
     with pytest.raises(FieldFormatError, match="is no file, but a pipe, a folder or a device"):
         load_field(tmp_path / "pipe.rff")
 
 
-def test_a_raw_archive_takes_no_more_memory_than_it_may(make_gaussians) -> None:
+def test_a_raw_archive_takes_no_more_memory_than_it_may():
     field = SplatField(make_gaussians(40))
     data = encode_field(field)
     taken_bytes = sum(array.nbytes for array in field.archive().arrays.values())

@@ -41,7 +41,7 @@ def with_poses(pictures: list[PosedPicture], change) -> list[PosedPicture]:
     ]
 
 
-def test_a_field_that_fits_is_not_searched_for(place) -> None:
+def test_a_field_that_fits_is_not_searched_for(place):
     fit = check_field(place.field, place.pictures)
     assert (fit.convention, fit.fits, fit.tried) == (AS_GIVEN, True, 1)
     assert fit.psnr_db > 50
@@ -63,9 +63,7 @@ def test_a_field_that_fits_is_not_searched_for(place) -> None:
         ),
     ],
 )
-def test_a_field_in_other_axes_or_units_is_named_and_put_right(
-    place, field_from_world: Similarity, named: str
-) -> None:
+def test_a_field_in_other_axes_or_units_is_named_and_put_right(place, field_from_world, named):
     wrong = in_frame(place.field, field_from_world)
     fit = check_field(wrong, place.pictures)
     assert fit.fits
@@ -91,9 +89,7 @@ def test_a_field_in_other_axes_or_units_is_named_and_put_right(
         ),
     ],
 )
-def test_nerfstudios_transform_is_tried_every_way(
-    place, field_from_world: Similarity, named: str
-) -> None:
+def test_nerfstudios_transform_is_tried_every_way(place, field_from_world, named):
     fit = check_field(in_frame(place.field, field_from_world), place.pictures, NERFSTUDIO)
     assert fit.fits
     assert named in fit.convention.name
@@ -108,7 +104,7 @@ def test_nerfstudios_transform_is_tried_every_way(
         (lambda pose: pose.compose(AS_OPENGL).inverse(), "poses inverted, OpenGL camera axes"),
     ],
 )
-def test_poses_of_another_convention_are_blamed_on_the_drive(place, change, named: str) -> None:
+def test_poses_of_another_convention_are_blamed_on_the_drive(place, change, named):
     fit = check_field(place.field, with_poses(place.pictures, change))
     assert fit.fits
     assert named == fit.convention.name
@@ -117,7 +113,7 @@ def test_poses_of_another_convention_are_blamed_on_the_drive(place, change, name
         in_drive_world(place.field, fit.convention)
 
 
-def test_a_field_of_another_place_fits_nowhere(place) -> None:
+def test_a_field_of_another_place_fits_nowhere(place):
     g = place.field.gaussians
     rng = np.random.default_rng(9)
     order = rng.permutation(len(g))
@@ -127,7 +123,7 @@ def test_a_field_of_another_place_fits_nowhere(place) -> None:
     assert fit.tried == len(list(known_conventions(None))) == 4 * 4 * 24
 
 
-def test_pairs_show_the_camera_beside_the_render(place) -> None:
+def test_pairs_show_the_camera_beside_the_render(place):
     rgb, values_db = pairs_picture(place.field, place.pictures, AS_GIVEN)
     assert rgb.shape == (4 * 64, 2 * 96, 3)
     assert len(values_db) == 4
@@ -136,7 +132,7 @@ def test_pairs_show_the_camera_beside_the_render(place) -> None:
     np.testing.assert_array_equal(rgb[-64:, :96], place.pictures[-1].read())
 
 
-def test_a_drive_without_pictures_is_refused(place) -> None:
+def test_a_drive_without_pictures_is_refused(place):
     with pytest.raises(InvalidInput, match="has no pictures"):
         check_field(place.field, [])
 
@@ -157,12 +153,9 @@ def pictures_of(field: SplatField, pictures: list[PosedPicture]) -> list[PosedPi
 
 @pytest.mark.parametrize("antialiased", [True, False])
 @pytest.mark.parametrize("stated", [True, False])
-def test_the_mode_that_the_pictures_were_drawn_in_fits(
-    place, antialiased: bool, stated: bool
-) -> None:
+def test_the_mode_that_the_pictures_were_drawn_in_fits(place, antialiased, stated):
     pictures = pictures_of(tiny_splats(place, antialiased=antialiased), place.pictures)
     fit = check_field(tiny_splats(place, antialiased=stated), pictures)
-    assert fit.mode is not None
     assert fit.mode.antialiased == antialiased
     assert (fit.convention, fit.fits, fit.tried) == (AS_GIVEN, True, 1)
     assert (fit.psnr_db == fit.as_given_db) == (antialiased == stated)
@@ -180,14 +173,14 @@ def test_the_mode_that_the_pictures_were_drawn_in_fits(
     ],
 )
 def test_the_stated_mode_is_believed_unless_the_other_is_clearly_better(
-    stated: bool, antialiased_db: float, default_db: float, fits: bool
-) -> None:
+    stated, antialiased_db, default_db, fits
+):
     mode = ModeFit(stated, antialiased_db, default_db)
     assert mode.antialiased is fits
     assert mode.psnr_db == (antialiased_db if fits else default_db)
 
 
-def test_a_field_in_another_mode_forgets_what_was_measured_in_its_own(place) -> None:
+def test_a_field_in_another_mode_forgets_what_was_measured_in_its_own(place):
     field = tiny_splats(place, antialiased=False)
     assert drawn_antialiased(field, False) is field
     other = drawn_antialiased(field, True)

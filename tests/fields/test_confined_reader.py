@@ -27,7 +27,7 @@ def ply(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_splats_are_those_read_in_this_process(ply: Path, kind: Confinement) -> None:
+def test_the_splats_are_those_read_in_this_process(ply, kind):
     for origin in (None, ORIGIN):
         there, stated, confinement = read_confined(ply, origin, MAX_BYTES, (kind,))
         here, _ = read_splat_file(ply, origin)
@@ -37,7 +37,7 @@ def test_the_splats_are_those_read_in_this_process(ply: Path, kind: Confinement)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_wrong_is_said_in_the_same_words(ply: Path, kind: Confinement) -> None:
+def test_what_is_wrong_is_said_in_the_same_words(ply, kind):
     ply.write_bytes(ply.read_bytes()[:-1])
     with pytest.raises(FieldFormatError) as here:
         read_splat_file(ply)
@@ -46,20 +46,18 @@ def test_what_is_wrong_is_said_in_the_same_words(ply: Path, kind: Confinement) -
     assert str(there.value) == str(here.value)
 
 
-def test_what_takes_too_much_memory_is_refused(ply: Path) -> None:
+def test_what_takes_too_much_memory_is_refused(ply):
     with pytest.raises(FieldFormatError, match=r"50 of SH degree 1 take .* raise it"):
         read_confined(ply, None, 50 * 23 * 4 - 1, (Confinement.LANDLOCK,))
 
 
-def test_the_next_confinement_is_tried_and_none_at_all_is_an_error(
-    ply: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_next_confinement_is_tried_and_none_at_all_is_an_error(ply, monkeypatch):
     monkeypatch.setattr("rfcore.confinement.start.shutil.which", lambda _: None)
     assert read_confined(ply, None, MAX_BYTES)[2] is Confinement.LANDLOCK
     with pytest.raises(BackendUnavailable, match=r"bwrap is not on PATH.*give --unconfined"):
         read_confined(ply, None, MAX_BYTES, (Confinement.BUBBLEWRAP,))
 
 
-def test_a_missing_file_is_one_error(tmp_path: Path) -> None:
+def test_a_missing_file_is_one_error(tmp_path):
     with pytest.raises(FieldFormatError, match=r"none\.ply: cannot be read"):
         read_confined(tmp_path / "none.ply", None, MAX_BYTES)

@@ -21,18 +21,18 @@ def error(field: SplatField, place) -> float:
 
 
 @pytest.mark.parametrize("keep", [1, 30, 150, 299])
-def test_as_many_splats_are_kept_as_asked_for(place, keep: int) -> None:
+def test_as_many_splats_are_kept_as_asked_for(place, keep):
     small = slimmed(place.field, keep)
     assert small.primitives == keep
     assert small.metadata.held_out_psnr_db is None, "it was not measured"
     assert small.metadata.name == "cloud"
 
 
-def test_keeping_all_keeps_the_picture(place) -> None:
+def test_keeping_all_keeps_the_picture(place):
     assert error(slimmed(place.field, 300), place) < 1e-3
 
 
-def test_cameras_make_the_choice_better_and_fitting_better_still(place) -> None:
+def test_cameras_make_the_choice_better_and_fitting_better_still(place):
     cameras = [picture.camera for picture in place.pictures]
     blind = error(slimmed(place.field, 120), place)
     fitted = error(slimmed(place.field, 120, cameras, LevelFitConfig(iterations=90)), place)
@@ -43,7 +43,7 @@ def test_cameras_make_the_choice_better_and_fitting_better_still(place) -> None:
 
 
 @pytest.mark.parametrize("keep", [0, -1, 301])
-def test_more_splats_than_there_are_or_none_are_refused(place, keep: int) -> None:
+def test_more_splats_than_there_are_or_none_are_refused(place, keep):
     with pytest.raises(InvalidInput, match=f"keep: {keep} is outside 1..300"):
         slimmed(place.field, keep)
 
@@ -57,7 +57,7 @@ def size_bytes(field: SplatField) -> int:
     return len(encode_field(field))
 
 
-def test_a_field_is_as_large_as_it_may_be(place) -> None:
+def test_a_field_is_as_large_as_it_may_be(place):
     most = sizer(place).sized(place.field, SizeGoal())
     assert most.primitives == place.field.primitives
     assert most.metadata.held_out_psnr_db is None, "it was not measured"
@@ -68,7 +68,7 @@ def test_a_field_is_as_large_as_it_may_be(place) -> None:
     assert error(most, place) < error(small, place) < 0.1
 
 
-def test_levels_that_a_field_has_already_are_not_counted_twice(place) -> None:
+def test_levels_that_a_field_has_already_are_not_counted_twice(place):
     """They are fitted anew, so that a field is sized as the same splats without levels are."""
     leveled = with_levels(
         place.field, [p.camera for p in place.pictures], LevelFitConfig(iterations=2)
@@ -81,7 +81,7 @@ def test_levels_that_a_field_has_already_are_not_counted_twice(place) -> None:
         assert kept[0] == kept[1]
 
 
-def test_a_limit_no_size_keeps_is_refused_with_the_least_there_is(place) -> None:
+def test_a_limit_no_size_keeps_is_refused_with_the_least_there_is(place):
     share = f"{SIZES[-1].share:.0%}"
     with pytest.raises(InvalidInput, match=f"max_mb: 900 bytes are too few: .* {share} of the"):
         sizer(place).sized(place.field, SizeGoal(max_bytes=900))
@@ -89,7 +89,7 @@ def test_a_limit_no_size_keeps_is_refused_with_the_least_there_is(place) -> None
         SizeGoal(passes=0)
 
 
-def test_the_more_passes_the_larger_the_field(place) -> None:
+def test_the_more_passes_the_larger_the_field(place):
     """One pass of six small frames is worth few splats, a million passes are worth them all."""
     once, often = (
         sizer(place).sized(place.field, SizeGoal(passes=passes)) for passes in (1, 1_000_000)

@@ -10,7 +10,7 @@ from rfedge.fields.viewpoints import UPS, OrbitSettings, look_around, looking_at
 
 
 @pytest.mark.parametrize("up", sorted(UPS))
-def test_an_orbit_keeps_the_middle_in_the_middle_and_up_upright(place, up: str) -> None:
+def test_an_orbit_keeps_the_middle_in_the_middle_and_up_upright(place, up):
     middle = np.median(place.field.gaussians.means, axis=0)
     cameras = orbit(place.field, OrbitSettings(frames=7, width_px=64, height_px=48, up=up))
     assert len(cameras) == 7
@@ -22,7 +22,7 @@ def test_an_orbit_keeps_the_middle_in_the_middle_and_up_upright(place, up: str) 
         assert above_px < v_px, "what is higher is higher in the picture"
 
 
-def test_four_cameras_look_around_from_the_middle(place) -> None:
+def test_four_cameras_look_around_from_the_middle(place):
     cameras = look_around(place.field)
     middle = np.median(place.field.gaussians.means, axis=0)
     ways = [np.array(c.world_from_cam.rotation_matrix())[:, 2] for c in cameras]
@@ -32,18 +32,18 @@ def test_four_cameras_look_around_from_the_middle(place) -> None:
     assert all(place.field.render(c).opacity.mean() > 0.2 for c in cameras)
 
 
-def test_an_empty_field_can_be_orbited() -> None:
+def test_an_empty_field_can_be_orbited():
     nothing = Gaussians(*(np.zeros((0, *s), "f4") for s in ((3,), (4,), (3,), (), (1, 3))))
     assert len(orbit(SplatField(nothing), OrbitSettings(frames=2))) == 2
 
 
-def test_a_camera_looks_where_it_is_told() -> None:
+def test_a_camera_looks_where_it_is_told():
     pose = looking_at(np.array([1.0, 2, 3]), np.array([1.0, 7, 3]), np.array([0.0, 0, 1]))
     np.testing.assert_allclose(pose.apply((0, 0, 2)), (1, 4, 3), atol=1e-12)
     np.testing.assert_allclose(pose.apply((0, 1, 0)), (1, 2, 2), atol=1e-12)
 
 
 @pytest.mark.parametrize("wrong", [{"frames": 0}, {"up": "x"}, {"distance": 0.0}])
-def test_an_orbit_that_is_none_is_refused(wrong: dict) -> None:
+def test_an_orbit_that_is_none_is_refused(wrong):
     with pytest.raises(InvalidInput, match=next(iter(wrong))):
         OrbitSettings(**wrong)

@@ -25,7 +25,6 @@ def load_sources_plainly() -> str:
     than that this finder is unusual.
     """
     spec = importlib.util.find_spec("rfcore.native._native")
-    assert spec is not None
     assert spec.origin is not None
     for name in [name for name in sys.modules if name.partition(".")[0] == "rfcore"]:
         del sys.modules[name]

@@ -47,8 +47,6 @@ from rfcore.wire.drive_file import read_drive
 from rfcore.wire.messages import Frame, Hello
 from rfcore.wire.tile_manifest import MANIFEST, read_publication
 
-__all__ = ["TARGETS"]
-
 FEW_BYTES = 1 << 24
 """Memory that a field of a fuzzer may take."""
 FOLDER = Path(tempfile.mkdtemp())

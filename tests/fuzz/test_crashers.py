@@ -13,7 +13,7 @@ INPUTS = sorted(path for folder in ("corpus", "crashers") for path in (HERE / fo
 
 
 @pytest.mark.parametrize("path", INPUTS, ids=lambda path: f"{path.parent.name}-{path.name[:20]}")
-def test_an_input_is_read_or_refused(path: Path) -> None:
+def test_an_input_is_read_or_refused(path):
     TARGETS[path.parent.name](path.read_bytes())
 
 
@@ -30,12 +30,12 @@ print(*loaders)
 """
 
 
-def test_sources_are_loaded_by_what_atheris_can_instrument() -> None:
+def test_sources_are_loaded_by_what_atheris_can_instrument():
     command = [sys.executable, "-c", PLAINLY]
     ran = subprocess.run(command, cwd=HERE, capture_output=True, text=True)
     assert ran.stdout == "SourceFileLoader\n", ran.stderr
 
 
-def test_every_target_has_something_to_start_from() -> None:
+def test_every_target_has_something_to_start_from():
     assert {path.parent.name for path in INPUTS} == set(TARGETS)
     assert "atheris" not in sys.modules, "the tests do without the fuzzer"

@@ -72,9 +72,7 @@ def moved(gaussians: Gaussians, pose: Pose) -> Gaussians:
 
 @settings(max_examples=30)
 @given(seeds, st.tuples(angles, angles, angles), st.tuples(metres, metres, metres))
-def test_moving_scene_and_camera_together_changes_nothing(
-    seed: int, turn: tuple[float, float, float], shift: tuple[float, float, float]
-) -> None:
+def test_moving_scene_and_camera_together_changes_nothing(seed, turn, shift):
     pose = Pose(shift, quaternion_from_vector(turn))
     got = drawn(moved(cloud(seed), pose), pose)
     assert_alike(got.colour, drawn(cloud(seed)).colour)
@@ -82,7 +80,7 @@ def test_moving_scene_and_camera_together_changes_nothing(
 
 @settings(max_examples=30)
 @given(seeds, st.floats(2.0, 7.0))
-def test_a_scene_split_in_depth_is_composed_again_by_over(seed: int, depth_m: float) -> None:
+def test_a_scene_split_in_depth_is_composed_again_by_over(seed, depth_m):
     """C = C_front + (1 - O_front) C_back, as long as the light does not run out on the way."""
     gaussians = replace(cloud(seed), opacity_logits=cloud(seed).opacity_logits - np.float32(2.0))
     in_front = gaussians.means[:, 2] < np.float32(depth_m)
@@ -95,7 +93,7 @@ def test_a_scene_split_in_depth_is_composed_again_by_over(seed: int, depth_m: fl
 
 @settings(max_examples=30)
 @given(seeds, seeds)
-def test_the_order_of_the_file_changes_not_a_byte(seed: int, shuffle: int) -> None:
+def test_the_order_of_the_file_changes_not_a_byte(seed, shuffle):
     order = np.random.default_rng(shuffle).permutation(40)
     a, b = drawn(cloud(seed)), drawn(picked(cloud(seed), order))
     assert a.colour.tobytes() == b.colour.tobytes()
@@ -104,7 +102,7 @@ def test_the_order_of_the_file_changes_not_a_byte(seed: int, shuffle: int) -> No
 
 @settings(max_examples=30)
 @given(seeds, seeds)
-def test_at_equal_depths_the_order_of_the_file_is_that_of_drawing(seed: int, shuffle: int) -> None:
+def test_at_equal_depths_the_order_of_the_file_is_that_of_drawing(seed, shuffle):
     """Any order that keeps the coplanar ones in sequence gives the same bytes."""
     gaussians = cloud(seed)
     gaussians.means[::2, 2] = 3.0
@@ -117,7 +115,7 @@ def test_at_equal_depths_the_order_of_the_file_is_that_of_drawing(seed: int, shu
 
 @settings(max_examples=30)
 @given(seeds, st.integers(-4, 20))
-def test_a_world_of_another_unit_looks_the_same(seed: int, power: int) -> None:
+def test_a_world_of_another_unit_looks_the_same(seed, power):
     """Metres to the power of two: means scale exactly, log scales to one rounding. From 10 km on
     it is sky: the same colours and opacity, all as deep as that."""
     gaussians, scale = cloud(seed), 2.0**power

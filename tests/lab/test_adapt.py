@@ -4,7 +4,6 @@ import io
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,27 +32,27 @@ from rfedge.evaluate.performance import Performance
 from rfedge.samples import sample_path
 
 
-def test_what_is_recovered_is_a_share_of_the_loss() -> None:
+def test_what_is_recovered_is_a_share_of_the_loss():
     assert recovered_percent(75.0, 25.0, 75.0) == 0.0
     assert recovered_percent(75.0, 25.0, 50.0) == 50.0
     assert recovered_percent(75.0, 25.0, 20.0) == pytest.approx(110.0)
     assert recovered_percent(75.0, 25.0, 80.0) == pytest.approx(-10.0)
 
 
-def test_without_a_loss_nothing_is_recovered() -> None:
+def test_without_a_loss_nothing_is_recovered():
     assert recovered_percent(75.0, None, 50.0) is None
     assert recovered_percent(75.0, 25.0, None) is None
     assert recovered_percent(None, 25.0, 20.0) is None
     assert recovered_percent(25.0, 25.0, 20.0) is None
 
 
-def test_a_loss_of_less_than_a_tenth_is_not_shared_out() -> None:
+def test_a_loss_of_less_than_a_tenth_is_not_shared_out():
     """Dusk at 36 dB costs 2 % more than noon: what a field wins beside would be 4,000 % of that."""
     assert recovered_percent(27.4, 25.0, 5.0) is None
     assert recovered_percent(27.6, 25.0, 25.0) == pytest.approx(100.0)
 
 
-def test_a_second_vehicle_pays_for_what_is_new_as_the_first_one_or_not_at_all() -> None:
+def test_a_second_vehicle_pays_for_what_is_new_as_the_first_one_or_not_at_all():
     assert second_vehicle_percent(60.0, 20.0, 60.0) == 100.0
     assert second_vehicle_percent(60.0, 20.0, 40.0) == 50.0
     assert second_vehicle_percent(60.0, 20.0, 20.0) == 0.0
@@ -76,7 +75,7 @@ def coded_at(*points: tuple[float, int]) -> Performance:
     return Performance("ours", clips, 1.0)
 
 
-def test_bits_at_a_quality_are_those_of_the_curve_and_none_are_made_up_outside_it() -> None:
+def test_bits_at_a_quality_are_those_of_the_curve_and_none_are_made_up_outside_it():
     done = coded_at(*((40.0 - 2 * n, 1000 - 100 * n) for n in range(6)))
     assert kbit_at(36.0, done) == pytest.approx(8 * 0.8)
     assert kbit_at(30.0, done) == pytest.approx(8 * 0.5)
@@ -84,7 +83,7 @@ def test_bits_at_a_quality_are_those_of_the_curve_and_none_are_made_up_outside_i
     assert kbit_at(40.1, done) is None
 
 
-def test_the_first_frame_has_a_curve_of_its_own() -> None:
+def test_the_first_frame_has_a_curve_of_its_own():
     done = coded_at(*((40.0 - 2 * n, 1000 - 100 * n) for n in range(6)))
     for clip in done.clips:
         clip.frame_bytes[0] = 5 * clip.frame_bytes[1]
@@ -92,21 +91,21 @@ def test_the_first_frame_has_a_curve_of_its_own() -> None:
     assert kbit_at(40.1, done, FIRST) is None
 
 
-def test_above_33_db_the_fewest_bits_are_an_upper_bound() -> None:
+def test_above_33_db_the_fewest_bits_are_an_upper_bound():
     good = coded_at(*((44.0 - 2 * n, 1000 - 100 * n) for n in range(6)))
     assert kbit_at(33.0, good) is None
     assert most_kbit(good) == pytest.approx(8 * 0.5)
     assert most_kbit(coded_at(*((40.0 - 2 * n, 1000 - 100 * n) for n in range(6)))) is None
 
 
-def test_a_field_is_paid_for_after_so_many_drives_or_never() -> None:
+def test_a_field_is_paid_for_after_so_many_drives_or_never():
     assert drives_to_break_even(100_000, 50.0, 10.0, 20) == pytest.approx(1.0)
     assert drives_to_break_even(100_000, 10.0, 10.0, 20) is None
     assert drives_to_break_even(0, 50.0, 10.0, 20) is None
     assert drives_to_break_even(100_000, None, 10.0, 20) is None
 
 
-def test_messages_are_compared_one_by_one() -> None:
+def test_messages_are_compared_one_by_one():
     def sent(*messages: tuple[str, str]) -> Performance:
         clips = tuple(
             replace(clip, notes={"message": named})
@@ -119,7 +118,7 @@ def test_messages_are_compared_one_by_one() -> None:
     assert messages_differ(off, sent(("a", "x"), ("d", "c"))) == 3
 
 
-def test_a_tools_time_is_its_own(flat_frames: list[I420]) -> None:
+def test_a_tools_time_is_its_own(flat_frames):
     spent = tool_ms(flat_frames, flat_frames)
     assert spent["off"] == 0
     assert spent["auto"] > 0
@@ -128,7 +127,7 @@ def test_a_tools_time_is_its_own(flat_frames: list[I420]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["empty", "vehicles"])
-def test_in_the_fields_own_light_no_message_differs_from_off(name: str) -> None:
+def test_in_the_fields_own_light_no_message_differs_from_off(name):
     """Vehicles, which the field has not seen, move block means by up to 2.5 levels."""
     drive = read_drive(f"noon@10={sample_path(f'street/transforms_drive_{name}.json')}")
     rendered = render_clip(load_field(sample_path("fields/street.rff")), drive.cameras)
@@ -147,7 +146,7 @@ def flat_frames() -> list[I420]:
     return [I420(*planes)] * 3
 
 
-def test_a_case_names_its_drive_fields_and_variants() -> None:
+def test_a_case_names_its_drive_fields_and_variants():
     case = AdaptCase.parse("dusk@10=d.json,field=f.rff,noon=n.json,learnt=g.rff,layer=l.rff")
     assert (case.drive.scene, case.drive.rate_hz, case.drive.dataset) == (
         "dusk",
@@ -179,12 +178,12 @@ def test_a_case_names_its_drive_fields_and_variants() -> None:
         ("dusk@10=d.json,field=f,noon:2=g", "'noon' is not learnt from passes"),
     ],
 )
-def test_a_case_of_another_form_is_refused(text: str, said: str) -> None:
+def test_a_case_of_another_form_is_refused(text, said):
     with pytest.raises(InvalidInput, match=said):
         AdaptCase.parse(text)
 
 
-def test_a_job_without_cases_is_refused() -> None:
+def test_a_job_without_cases_is_refused():
     with pytest.raises(InvalidInput, match="cases"):
         EvalAdapt(cases=())
 
@@ -200,9 +199,7 @@ def job_of(text: str, folder: Path) -> EvalAdapt:
     )
 
 
-def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
-    thumbnail: Any, tmp_path: Path
-) -> None:
+def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(thumbnail, tmp_path):
     """Another name for the same field changes no bit; at noon a tool that is not used neither."""
     text = f"{thumbnail.drive},field={thumbnail.field},again:2/1={thumbnail.field}"
     text += f",noon={thumbnail.drive.partition('=')[2]}"
@@ -234,9 +231,7 @@ def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
     assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
 
 
-def test_where_a_field_shows_33_db_before_a_bit_is_sent_no_bits_are_stated(
-    thumbnail: Any, tmp_path: Path
-) -> None:
+def test_where_a_field_shows_33_db_before_a_bit_is_sent_no_bits_are_stated(thumbnail, tmp_path):
     text = f"{thumbnail.empty},field={thumbnail.field},again={thumbnail.field}"
     text += f",empty={thumbnail.empty.partition('=')[2]}"
     job = job_of(text, tmp_path)
@@ -267,7 +262,7 @@ ROW = AdaptRow(
 )
 
 
-def test_bits_are_told_as_a_bound_where_a_field_shows_more_before_a_bit_is_sent() -> None:
+def test_bits_are_told_as_a_bound_where_a_field_shows_more_before_a_bit_is_sent():
     assert ROW.kbit_text == "71.7 (-28.3 %)"
     assert replace(ROW, kbit_33db=None).kbit_text is None
     assert replace(ROW, kbit_33db=None, kbit_33db_at_most=20.0).kbit_text == "≤ 20.0 (-80.0 %)"

@@ -57,12 +57,12 @@ def quiet(_text: str) -> None:
 # --- the definition -----------------------------------------------------------------------------
 
 
-def test_v1_is_frozen() -> None:
+def test_v1_is_frozen():
     """What ought to be different becomes v2 beside it: scores name this digest."""
     assert hashlib.sha256(V1.read_bytes()).hexdigest() == V1_SHA256
 
 
-def test_v1_is_read_with_its_anchors() -> None:
+def test_v1_is_read_with_its_anchors():
     v1 = read_benchmark()
     assert v1.version == "rfedge-bench v1"
     assert {(d.name, a.name) for d in v1.drives for a in v1.anchors} == v1.anchor_clips.keys()
@@ -74,11 +74,11 @@ def test_v1_is_read_with_its_anchors() -> None:
 
 
 @pytest.mark.parametrize("name", ["sample-empty", "sample-vehicles"])
-def test_the_samples_are_the_drives_of_v1(name: str) -> None:
+def test_the_samples_are_the_drives_of_v1(name):
     assert len(read_benchmark().drive(name).read().frames) == 24
 
 
-def test_v1_compares_as_the_comparison_does() -> None:
+def test_v1_compares_as_the_comparison_does():
     """Code that no longer does what v1 says needs a v2, not another v1."""
     scoring = read_benchmark().scoring
     assert scoring.windows_db == WINDOWS_DB
@@ -86,7 +86,7 @@ def test_v1_compares_as_the_comparison_does() -> None:
     assert scoring.least_points == MIN_POINTS
 
 
-def test_the_anchors_of_v1_run_as_the_rivals_of_the_comparison() -> None:
+def test_the_anchors_of_v1_run_as_the_rivals_of_the_comparison():
     families = rival_families("veryfast", quick=False)
     rivals = {rival.name: rival for family in families.values() for rival in family}
     for anchor in read_benchmark().anchors:
@@ -95,7 +95,7 @@ def test_the_anchors_of_v1_run_as_the_rivals_of_the_comparison() -> None:
         assert same == (anchor.encoder, anchor.decoder, dict(anchor.options)), anchor.name
 
 
-def test_an_anchor_comes_out_as_it_is_recorded() -> None:
+def test_an_anchor_comes_out_as_it_is_recorded():
     v1 = read_benchmark()
     (anchor,) = [a for a in v1.anchors if a.name == "x264-lowdelay-veryfast"]
     rows = json.loads(v1.recorded.read_text())
@@ -108,7 +108,7 @@ def test_an_anchor_comes_out_as_it_is_recorded() -> None:
     assert coded.luma_mse.tolist() == pytest.approx(recorded.luma_mse[:3].tolist(), rel=1e-12)
 
 
-def test_v1_scores_as_it_did_when_it_was_frozen() -> None:
+def test_v1_scores_as_it_did_when_it_was_frozen():
     v1 = read_benchmark()
     headline = replace(v1.scoring, windows_db=v1.scoring.windows_db[:1])
     v1 = replace(v1, scoring=headline, anchors=v1.anchors[:1])
@@ -126,25 +126,25 @@ def test_v1_scores_as_it_did_when_it_was_frozen() -> None:
 GOLDEN_BD_RATE, GOLDEN_CI95 = -3.593759041767455, (-5.691207891814563, -1.9795819112294164)
 
 
-def test_anchors_that_were_changed_are_refused(tmp_path: Path) -> None:
+def test_anchors_that_were_changed_are_refused(tmp_path):
     changed = tmp_path / "anchors.json"
     changed.write_text("[]\n")
     with pytest.raises(InvalidData, match=r"has the digest .*, rfedge-bench v1 names"):
         _ = replace(read_benchmark(), recorded=changed).anchor_clips
 
 
-def test_a_key_that_v1_does_not_know_is_refused(tmp_path: Path) -> None:
+def test_a_key_that_v1_does_not_know_is_refused(tmp_path):
     (tmp_path / "v.toml").write_text(V1.read_text().replace("seed = 2026", "seeds = 2026"))
     with pytest.raises(InvalidData, match=r"interval\.seed is missing"):
         read_benchmark(tmp_path / "v.toml")
 
 
-def test_a_drive_that_nobody_ships_says_how_to_get_it() -> None:
+def test_a_drive_that_nobody_ships_says_how_to_get_it():
     with pytest.raises(InvalidInput, match=r"kitti-loop is not here: .*KITTI odometry 00"):
         read_benchmark().drive("kitti-loop").read()
 
 
-def test_points_too_far_apart_in_a_window_are_refused() -> None:
+def test_points_too_far_apart_in_a_window_are_refused():
     scoring = read_benchmark().scoring
     curve = RateCurve(np.array([20.0, 25, 30, 33.5, 36, 40]), np.arange(1.0, 7))
     with pytest.raises(InvalidInput, match=r"none between 30\.00 and 33\.50 dB.*limit is 3 dB"):
@@ -194,8 +194,8 @@ def copied(handed_in: Path, tmp_path: Path) -> Path:
 
 
 def test_x264_by_a_command_scores_as_the_rival_of_the_comparison(
-    small: Benchmark, handed_in: Path, thumbnail: Any, tmp_path: Path
-) -> None:
+    small, handed_in, thumbnail, tmp_path
+):
     """The same encoder by both doors: equal packets, equal errors, no difference in rate."""
     from rfedge.jobs import CellStore
 
@@ -210,7 +210,7 @@ def test_x264_by_a_command_scores_as_the_rival_of_the_comparison(
     assert row["ci95"] == pytest.approx((0, 0), abs=1e-9)
 
 
-def test_a_result_says_what_was_checked_and_what_was_not(small: Benchmark, handed_in: Path) -> None:
+def test_a_result_says_what_was_checked_and_what_was_not(small, handed_in):
     content = check_submission(handed_in, small, {}, tell=quiet)
     assert any("no --decoder was named" in what for what in content["not_checked"])
     assert any("made without later frames" in what for what in content["not_checked"])
@@ -227,7 +227,7 @@ def test_a_result_says_what_was_checked_and_what_was_not(small: Benchmark, hande
     assert "* wall: the prior of 10 bytes is never paid for." in remarks
 
 
-def test_pictures_may_be_handed_in_as_png(small: Benchmark, copied: Path, handed_in: Path) -> None:
+def test_pictures_may_be_handed_in_as_png(small, copied, handed_in):
     """RGB rounds once more: by less than a tenth of a decibel at these qualities."""
     for raw in copied.glob("wall/*/*.yuv"):
         picture = I420.unpacked((96, 64), raw.read_bytes())
@@ -350,22 +350,20 @@ POISON: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("name", POISON)
-def test_a_poisoned_submission_is_refused_with_its_fault(
-    name: str, small: Benchmark, copied: Path
-) -> None:
+def test_a_poisoned_submission_is_refused_with_its_fault(name, small, copied):
     poison, message = POISON[name]
     poison(copied)
     with pytest.raises(RfedgeError, match=message):
         check_submission(copied, small, {}, tell=quiet)
 
 
-def test_a_window_that_is_not_spanned_is_refused(small: Benchmark, handed_in: Path) -> None:
+def test_a_window_that_is_not_spanned_is_refused(small, handed_in):
     scoring = replace(small.scoring, windows_db=((2.0, 36.0),))
     with pytest.raises(InvalidInput, match=r"2\.\.36 dB is not within .* more operating points"):
         check_submission(handed_in, replace(small, scoring=scoring), {}, tell=quiet)
 
 
-def test_better_pictures_that_are_stated_are_not_believed(small: Benchmark, copied: Path) -> None:
+def test_better_pictures_that_are_stated_are_not_believed(small, copied):
     """A picture of noise costs its decibels whatever else is handed in."""
     before = check_submission(copied, small, {}, tell=quiet)["curves"][0]["psnr_db"][0]
     noise = np.random.default_rng(1).integers(0, 255, 9216, np.uint8)
@@ -377,7 +375,7 @@ def test_better_pictures_that_are_stated_are_not_believed(small: Benchmark, copi
     assert after < before - 10
 
 
-def test_a_drive_of_other_frames_is_refused(small: Benchmark, thumbnail: Any) -> None:
+def test_a_drive_of_other_frames_is_refused(small, thumbnail):
     empty = Path(thumbnail.empty.partition("=")[2])
     with pytest.raises(InvalidInput, match=r"have the digest .*, those of wall have .*; get it"):
         small.drive("wall").read(empty)
@@ -404,7 +402,7 @@ def program(folder: Path, text: str) -> str:
     return f"{sys.executable} {folder / 'coder.py'} {{frames}} {{out}} {{point}}"
 
 
-def test_a_coder_that_looks_ahead_is_found_out(small: Benchmark, tmp_path: Path) -> None:
+def test_a_coder_that_looks_ahead_is_found_out(small, tmp_path):
     method = program(tmp_path, AHEAD.replace("LOOK", "1"))
     with pytest.raises(CodecError, match=r"frame 1 is another one when frames from 2 on are with"):
         run_method(job_of(tmp_path / "ahead", method), small, quiet)
@@ -423,9 +421,7 @@ def test_a_coder_that_looks_ahead_is_found_out(small: Benchmark, tmp_path: Path)
         ("while True: pass", r"not done after 0\.5 s; raise --timeout-s"),
     ],
 )
-def test_a_command_that_fails_is_reported(
-    text: str, message: str, small: Benchmark, tmp_path: Path
-) -> None:
+def test_a_command_that_fails_is_reported(text, message, small, tmp_path):
     job = job_of(tmp_path / "out", program(tmp_path, text))
     with pytest.raises(RfedgeError, match=message):
         run_method(replace(job, timeout_s=0.5 if "True" in text else 60), small, quiet)
@@ -438,17 +434,17 @@ def test_a_command_that_fails_is_reported(
         ("mine {frames} {point} {out} {crf}", r"has \{crf\}; placeholders are"),
     ],
 )
-def test_a_command_without_its_placeholders_is_refused(text: str, message: str) -> None:
+def test_a_command_without_its_placeholders_is_refused(text, message):
     with pytest.raises(InvalidInput, match=message):
         Command(text)
 
 
-def test_a_program_that_is_not_there_is_named() -> None:
+def test_a_program_that_is_not_there_is_named():
     with pytest.raises(InvalidInput, match="'no-such-codec' cannot be started"):
         Command("no-such-codec {frames} {point} {out}").run(frames="a", point="1", out="b")
 
 
-def test_too_few_points_are_refused_before_anything_runs(small: Benchmark, tmp_path: Path) -> None:
+def test_too_few_points_are_refused_before_anything_runs(small, tmp_path):
     job = job_of(tmp_path / "out", "no-such-codec {frames} {point} {out}", points=(1.0, 2.0))
     with pytest.raises(InvalidInput, match="points: 2 given, at least 6 are needed"):
         run_method(job, small, quiet)
@@ -476,26 +472,20 @@ def decoder_of(folder: Path, text: str = DECODER) -> Any:
     return partial(check_decoder, Command(command, DECODER_NEEDS))
 
 
-def test_a_decoder_makes_the_pictures_from_the_packets(
-    small: Benchmark, handed_in: Path, tmp_path: Path
-) -> None:
+def test_a_decoder_makes_the_pictures_from_the_packets(small, handed_in, tmp_path):
     content = check_submission(handed_in, small, {}, tell=quiet, check_decoder=decoder_of(tmp_path))
     assert any("from the packets alone" in what for what in content["checked"])
     assert not any("--decoder" in what for what in content["not_checked"])
 
 
-def test_pictures_that_the_packets_do_not_show_are_found_out(
-    small: Benchmark, copied: Path, thumbnail: Any, tmp_path: Path
-) -> None:
+def test_pictures_that_the_packets_do_not_show_are_found_out(small, copied, thumbnail, tmp_path):
     camera = read_drive(thumbnail.drive).frames[3]
     (copied / "wall" / "20" / "0003.yuv").write_bytes(camera.packed())
     with pytest.raises(CodecError, match=r"wall/20 the decoder makes another picture of frame 3"):
         check_submission(copied, small, {}, tell=quiet, check_decoder=decoder_of(tmp_path))
 
 
-def test_a_frame_that_needs_a_later_packet_is_found_out(
-    small: Benchmark, handed_in: Path, tmp_path: Path
-) -> None:
+def test_a_frame_that_needs_a_later_packet_is_found_out(small, handed_in, tmp_path):
     late = DECODER.replace("enumerate([*shown, *decoder.decode(None)])", "enumerate(shown[:-1])")
     with pytest.raises(CodecError, match="made no picture of frame"):
         check_submission(handed_in, small, {}, tell=quiet, check_decoder=decoder_of(tmp_path, late))
@@ -504,9 +494,7 @@ def test_a_frame_that_needs_a_later_packet_is_found_out(
 # --- our own coder, and the command line --------------------------------------------------------
 
 
-def test_our_own_coder_goes_through_the_same_door(
-    small: Benchmark, thumbnail: Any, tmp_path: Path
-) -> None:
+def test_our_own_coder_goes_through_the_same_door(small, thumbnail, tmp_path):
     ours = f"{sys.executable} {EXAMPLES / 'bench_rfedge.py'}"
     method = f"{ours} encode {{prior}}/wall.rff {{frames}} {{out}} {{point}}"
     decode = f"{ours} decode {{prior}}/wall.rff {{packets}} {{out}}"
@@ -520,7 +508,7 @@ def test_our_own_coder_goes_through_the_same_door(
     assert sum(point.frame_bytes) < max(int(clip.frame_bytes.sum()) for clip in x264)
 
 
-def test_the_command_line_names_drives_by_example() -> None:
+def test_the_command_line_names_drives_by_example():
     verb = parse(["benchmark", "check", "out/mine", "--drive", "kitti-loop"])
     with pytest.raises(InvalidInput, match="'kitti-loop' is not NAME=DATASET"):
         verb.run()

@@ -103,9 +103,7 @@ def block(vehicles: Any, entries_per_s: float = 0.0) -> TrafficBlock:
         ("cameras = 1", "cameras = 33", "outside 1..32"),
     ],
 )
-def test_a_wrong_value_is_named_with_its_file(
-    tmp_path: Path, old: str, new: str, said: str
-) -> None:
+def test_a_wrong_value_is_named_with_its_file(tmp_path, old, new, said):
     text = SAMPLE.read_text()
     assert old in text
     path = tmp_path / "wrong.toml"
@@ -115,13 +113,13 @@ def test_a_wrong_value_is_named_with_its_file(
     assert said in str(raised.value)
 
 
-def test_no_toml_is_no_city(tmp_path: Path) -> None:
+def test_no_toml_is_no_city(tmp_path):
     (tmp_path / "x.toml").write_text("cell = [")
     with pytest.raises(InvalidData, match="not a city"):
         read_city(tmp_path / "x.toml")
 
 
-def test_a_grid_has_hexagons_of_mean_weight_one() -> None:
+def test_a_grid_has_hexagons_of_mean_weight_one():
     town = grid_city(VehicleKind(DEMAND), Density((0.0, 1.0), (1.0, 1.0)), 100, 4, 3.0)
     assert len(town.cells) == len(town.servers) == 100
     assert town.cells.weight.mean() == pytest.approx(1)
@@ -132,7 +130,7 @@ def test_a_grid_has_hexagons_of_mean_weight_one() -> None:
     assert (away_m < 1.01 * away_m.min()).sum(axis=1).max() == 6
 
 
-def test_what_the_field_has_never_seen_costs_what_the_recorded_comparison_says() -> None:
+def test_what_the_field_has_never_seen_costs_what_the_recorded_comparison_says():
     recorded = read_result(RESULTS / "compare.json")
     empty, vehicles = (
         kbit_between(zip(curve["psnr_db"], curve["bytes_per_frame"], strict=True), 34.0, scene)
@@ -152,7 +150,7 @@ def test_what_the_field_has_never_seen_costs_what_the_recorded_comparison_says()
 # --- the flow
 
 
-def test_one_cell_is_what_rfedge_size_says() -> None:
+def test_one_cell_is_what_rfedge_size_says():
     told = estimate(DEMAND, shipped_tables()).estimates[0]
     town = city(uplink_mbps=Assumptions().cell_mbps, cores=1000.0, streams=1000)
     costs = costs_of(town, shipped_tables())
@@ -167,7 +165,7 @@ def test_one_cell_is_what_rfedge_size_says() -> None:
     assert over.rate_hz[0, 0] < 10.0
 
 
-def test_a_server_lets_in_whom_its_cores_permit() -> None:
+def test_a_server_lets_in_whom_its_cores_permit():
     """0.8 of 4 cores: 3.2, of which a vehicle at 10 Hz takes 0.3; 0.2 left are above 2 Hz."""
     flow = city_flow(city(uplink_mbps=1e4), COSTS, block([[10.0], [11.0], [15.0]]))
     assert flow.served[:, 0].tolist() == pytest.approx([10.0, 11.0, 11.0])
@@ -175,24 +173,24 @@ def test_a_server_lets_in_whom_its_cores_permit() -> None:
     assert flow.load_share[:, 0].tolist() == pytest.approx([3.0 / 3.2, 3.3 / 3.2, 4.5 / 3.2])
 
 
-def test_what_is_left_below_the_lowest_rate_is_nobodys() -> None:
+def test_what_is_left_below_the_lowest_rate_is_nobodys():
     town = replace(city(uplink_mbps=1e4), admission=Admission(AdmissionLimits(lowest_hz=7.0)))
     assert city_flow(town, COSTS, block([15.0])).served[0, 0] == pytest.approx(10.0)
 
 
-def test_one_vehicle_is_let_in_by_the_smallest_server() -> None:
+def test_one_vehicle_is_let_in_by_the_smallest_server():
     flow = city_flow(city(cores=0.01, uplink_mbps=1e4), COSTS, block([3.0]))
     assert flow.served[0, 0] == pytest.approx(1.0)
     assert flow.rate_hz[0, 0] == pytest.approx(2.0)
 
 
-def test_streams_are_a_limit_of_their_own() -> None:
+def test_streams_are_a_limit_of_their_own():
     flow = city_flow(city(cores=100.0, uplink_mbps=1e4, streams=7), COSTS, block([9.0]))
     assert flow.served[0, 0] == pytest.approx(7.0)
     assert flow.stream_share[0, 0] == pytest.approx(9 / 7)
 
 
-def test_a_slow_uplink_leaves_room_at_the_server() -> None:
+def test_a_slow_uplink_leaves_room_at_the_server():
     """At 2 of 10 Hz a vehicle is taken to need 2.5: four times as many are let in."""
     narrow = city(uplink_mbps=80 * 2 * 8 * 3000 / 1e6)
     flow = city_flow(narrow, COSTS, block([80.0]))
@@ -200,7 +198,7 @@ def test_a_slow_uplink_leaves_room_at_the_server() -> None:
     assert flow.cores[0, 0] == pytest.approx(3.2)
 
 
-def test_a_full_uplink_is_shared() -> None:
+def test_a_full_uplink_is_shared():
     narrow = city(uplink_mbps=20 * 8 * 8 * 3000 / 1e6, cores=100.0)
     flow = city_flow(narrow, COSTS, block([20.0]))
     assert flow.served[0, 0] == pytest.approx(20.0)
@@ -208,7 +206,7 @@ def test_a_full_uplink_is_shared() -> None:
     assert flow.rate_hz[0, 0] == pytest.approx(8.0)
 
 
-def test_coder_and_credits_limit_a_vehicle_on_its_own() -> None:
+def test_coder_and_credits_limit_a_vehicle_on_its_own():
     slow = replace(COSTS, sender_s=0.2)
     flow = city_flow(city(uplink_mbps=1e4), slow, block([1.0]))
     assert flow.rate_hz[0, 0] == pytest.approx(5.0)
@@ -221,9 +219,7 @@ demands = st.lists(st.floats(0, 400), min_size=4, max_size=4)
 
 @settings(max_examples=150, deadline=None)
 @given(demands, st.floats(0, 2), st.sampled_from((0.5, 4.0, 64.0)), st.floats(1, 200))
-def test_nothing_comes_from_nowhere(
-    vehicles: list[float], entries: float, cores: float, uplink_mbps: float
-) -> None:
+def test_nothing_comes_from_nowhere(vehicles, entries, cores, uplink_mbps):
     town = city(4, 2, cores, uplink_mbps)
     flow = city_flow(town, COSTS, block(vehicles, entries))
     there = np.array(vehicles)
@@ -240,9 +236,7 @@ def test_nothing_comes_from_nowhere(
 
 @settings(max_examples=150, deadline=None)
 @given(demands, st.floats(1, 5), st.sampled_from((0.5, 4.0, 64.0)), st.floats(1, 200))
-def test_more_demand_asks_for_more_and_serves_no_fewer(
-    vehicles: list[float], factor: float, cores: float, uplink_mbps: float
-) -> None:
+def test_more_demand_asks_for_more_and_serves_no_fewer(vehicles, factor, cores, uplink_mbps):
     town = city(4, 2, cores, uplink_mbps)
     less = city_flow(town, COSTS, block(vehicles))
     more = city_flow(town, COSTS, block(factor * np.array(vehicles)))
@@ -274,7 +268,7 @@ def lindley_waits(others: int, load: float, rounds: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(("others", "load"), [(10, 0.5), (30, 0.8), (60, 0.9)])
-def test_waits_are_those_of_periodic_sources(others: int, load: float) -> None:
+def test_waits_are_those_of_periodic_sources(others, load):
     waits = lindley_waits(others, load, 1500)
     for chance in (0.9, 0.99):
         told = queue_wait(np.array([chance]), np.array([others * 1.0]), np.array([load]), 0.0)[0]
@@ -291,20 +285,20 @@ def shared(vehicles: float, **changes: float) -> SharedLoad:
     return SharedLoad(**{name: np.array([value]) for name, value in (values | changes).items()})
 
 
-def test_the_age_of_a_lone_picture_is_a_sum() -> None:
+def test_the_age_of_a_lone_picture_is_a_sum():
     even = replace(COSTS, frame_ratios=(1.0,))
     ages_s = age_samples_s(even, shared(1.0), 1)
     assert ages_s.shape == (1, AGE_SAMPLES)
     assert ages_s == pytest.approx(0.04 + 8 * 3000 / 80e6 + 0.02 + 0.03)
 
 
-def test_ages_grow_with_company() -> None:
+def test_ages_grow_with_company():
     ages_s = [age_samples_s(COSTS, shared(n), 1) for n in (1.0, 50.0, 150.0, 300.0)]
     for fewer, more in pairwise(ages_s):
         assert np.all(more >= fewer)
 
 
-def test_a_saturated_cell_holds_what_credits_allow() -> None:
+def test_a_saturated_cell_holds_what_credits_allow():
     """600 vehicles of 0.3 ms a frame: two rounds take 360 ms, coding and the way 110 of them."""
     even = replace(COSTS, frame_ratios=(1.0,))
     rate_hz = 80e6 / (600 * 24000)
@@ -321,9 +315,7 @@ def test_a_saturated_cell_holds_what_credits_allow() -> None:
 # --- the command
 
 
-def test_a_city_is_planned_into_a_result(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_city_is_planned_into_a_result(tmp_path, capsys):
     pressed = tmp_path / "city.toml"
     pressed.write_text(SAMPLE.read_text().replace("cores = 6", "cores = 1"))
     out = tmp_path / "city.json"
@@ -336,7 +328,7 @@ def test_a_city_is_planned_into_a_result(
         parse(["city", str(pressed), "--out", str(out), "--step-s", "0"]).run()
 
 
-def test_a_trace_takes_the_place_of_the_demand(tmp_path: Path) -> None:
+def test_a_trace_takes_the_place_of_the_demand(tmp_path):
     steps = "".join(
         f'<timestep time="{step}"><vehicle id="a" x="{3 * step}" y="0"/></timestep>\n'
         for step in range(120)

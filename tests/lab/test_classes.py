@@ -67,7 +67,7 @@ def quarters(frames: int) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("group", [REST, VEHICLE, PERSON])
-def test_an_error_in_one_class_is_counted_there_and_nowhere_else(group: int) -> None:
+def test_an_error_in_one_class_is_counted_there_and_nowhere_else(group):
     frames, groups = [grey(100)] * 3, quarters(3)
     coded = ClassCoder(WrongInOneGroup(groups, group, 7), groups).code(frames, 10.0, 20.0)
     for index, name in enumerate(GROUPS):
@@ -75,7 +75,7 @@ def test_an_error_in_one_class_is_counted_there_and_nowhere_else(group: int) -> 
         assert coded.notes[f"{name}_sse"] == (expected,) * 3
 
 
-def test_the_classes_errors_add_up_to_the_pictures() -> None:
+def test_the_classes_errors_add_up_to_the_pictures():
     rng = np.random.default_rng(1)
     frames = [grey(int(level)) for level in rng.integers(20, 200, 4)]
     groups = [rng.integers(0, len(GROUPS), (8, 8)).astype(np.uint8) for _ in frames]
@@ -87,13 +87,13 @@ def test_the_classes_errors_add_up_to_the_pictures() -> None:
         assert total / 64 == pytest.approx(luma_mse(*pair)) == coded.luma_mse[i]
 
 
-def test_other_classes_make_another_cell() -> None:
+def test_other_classes_make_another_cell():
     groups, others = quarters(2), [LEVELS[np.zeros((8, 8), int)]] * 2
     coder = WrongInOneGroup(groups, REST, 1)
     assert ClassCoder(coder, groups).version != ClassCoder(coder, others).version
 
 
-def test_every_label_belongs_to_a_class_and_bicycles_to_people() -> None:
+def test_every_label_belongs_to_a_class_and_bicycles_to_people():
     assert [GROUPS[level] for level in LEVELS[[Label.PERSON, Label.BICYCLE]]] == ["person"] * 2
     assert len(LEVELS) == len(Label)
     named = (Label.VEHICLE, Label.SIGN, Label.MARKING, Label.ROAD)
@@ -139,7 +139,7 @@ def psnr(mse: float) -> float:
     return 10 * math.log10(255**2 / mse)
 
 
-def test_at_equal_bits_everybody_has_the_bits_of_the_first() -> None:
+def test_at_equal_bits_everybody_has_the_bits_of_the_first():
     """At an operating point of both the errors are those of that point."""
     ours, theirs = curve("ours", 0.5), curve("theirs", 2.0)
     at_db = ours.clips[2].psnr_db()
@@ -154,14 +154,14 @@ def test_at_equal_bits_everybody_has_the_bits_of_the_first() -> None:
     assert ("ours", "sign") not in found, "a class without a pixel has no quality"
 
 
-def test_between_operating_points_errors_follow_the_power_of_the_rate() -> None:
+def test_between_operating_points_errors_follow_the_power_of_the_rate():
     """A straight line over logarithms is kept exactly by the interpolation."""
     between = curve("ours", 0.5).mse_at(1400.0)
     assert between["vehicle"] == pytest.approx(0.5 * 32e3 / 1400, rel=1e-9)
     assert between["person"] == pytest.approx(64)
 
 
-def test_at_equal_quality_everybody_has_that_quality_for_its_own_bits() -> None:
+def test_at_equal_quality_everybody_has_that_quality_for_its_own_bits():
     ours, theirs = curve("ours", 0.5), curve("theirs", 2.0)
     rows = [r for r in quality_at([ours, theirs], CLIP, 33.0) if r.equal == "quality"]
     whole = {row.method: row for row in rows if row.class_ == "all"}
@@ -170,14 +170,14 @@ def test_at_equal_quality_everybody_has_that_quality_for_its_own_bits() -> None:
     assert whole["theirs"].bytes_per_frame > whole["ours"].bytes_per_frame
 
 
-def test_what_a_coder_does_not_reach_is_an_error_with_its_range() -> None:
+def test_what_a_coder_does_not_reach_is_an_error_with_its_range():
     with pytest.raises(InvalidInput, match=r"ours has 27.28..36.80 dB, not 50.00; .*--at-db"):
         list(quality_at([curve("ours", 1.0)], CLIP, 50.0))
     with pytest.raises(InvalidInput, match=r"ours has 250.*4000.* bytes a frame, not 100"):
         curve("ours", 1.0).mse_at(100.0)
 
 
-def test_a_quality_that_several_points_have_is_had_for_the_fewest_bytes() -> None:
+def test_a_quality_that_several_points_have_is_had_for_the_fewest_bytes():
     """As with a good field at rates where nothing is sent: its quality does not fall any more."""
     ours = curve("ours", 0.5)
     last = ours.clips[-1]
@@ -224,9 +224,7 @@ def job_of(field_file: Path, drive: str, folder: Path) -> EvalClasses:
     )
 
 
-def test_a_drive_becomes_rows_and_is_not_coded_twice(
-    thumbnail: Any, drive: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_becomes_rows_and_is_not_coded_twice(thumbnail, drive, tmp_path, monkeypatch):
     job = job_of(thumbnail.field, drive, tmp_path)
     said = io.StringIO()
     run_classes(job, Console(file=said, width=200))
@@ -249,8 +247,8 @@ def test_a_drive_becomes_rows_and_is_not_coded_twice(
 
 
 def test_missing_or_unfit_class_pictures_are_named_before_anything_is_coded(
-    thumbnail: Any, drive: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    thumbnail, drive, tmp_path, monkeypatch
+):
     monkeypatch.setattr(ClassCoder, "code", lambda *_: pytest.fail("a clip was coded"))
     with pytest.raises(DatasetError, match=r"0.png: is not in a folder `images`.*streetgen build"):
         run_classes(job_of(thumbnail.field, thumbnail.drive, tmp_path), Console())
@@ -274,7 +272,7 @@ def test_missing_or_unfit_class_pictures_are_named_before_anything_is_coded(
         ("out", Path("rows.txt"), "must end in .json"),
     ],
 )
-def test_a_job_that_cannot_be_is_refused(key: str, value: Any, said: str) -> None:
+def test_a_job_that_cannot_be_is_refused(key, value, said):
     job = job_of(Path("f.rff"), "a@1=b.json", Path("out"))
     with pytest.raises(InvalidInput, match=said):
         replace(job, **{key: value})

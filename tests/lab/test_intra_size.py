@@ -28,21 +28,21 @@ def built(tmp_path: Path, grain: np.ndarray) -> Path:
     return folder
 
 
-def test_detail_takes_bytes_and_so_does_being_shown_for_longer(grain: np.ndarray) -> None:
+def test_detail_takes_bytes_and_so_does_being_shown_for_longer(grain):
     coding = IntraCoding()
     assert intra_bytes(grain, coding) > 50 * intra_bytes(np.full_like(grain, 90), coding)
     assert intra_bytes(grain, IntraCoding(rate_hz=1)) > intra_bytes(grain, coding)
     assert intra_bytes(grain, IntraCoding(crf=33.0)) < intra_bytes(grain, coding)
 
 
-def test_a_picture_is_measured_alone(built: Path, grain: np.ndarray) -> None:
+def test_a_picture_is_measured_alone(built, grain):
     (sizes,) = sizes_of([built], IntraCoding())
     assert sizes.size_px == (160, 96)
     assert sizes.picture_bytes[0] == intra_bytes(grain, IntraCoding())
     assert "x: 2 I pictures of 160x96 px at 4 samples a pixel" in sizes.line()
 
 
-def test_figures_say_how_they_were_taken(built: Path, tmp_path: Path) -> None:
+def test_figures_say_how_they_were_taken(built, tmp_path):
     coding = IntraCoding(crf=26.0)
     write_sizes(tmp_path / "new" / "sizes.json", list(sizes_of([built], coding)), coding)
     result = json.loads((tmp_path / "new" / "sizes.json").read_text())
@@ -52,7 +52,7 @@ def test_figures_say_how_they_were_taken(built: Path, tmp_path: Path) -> None:
     assert {"command", "revision", "host"} <= result.keys()
 
 
-def test_what_cannot_be_measured_is_refused(built: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_measured_is_refused(built, tmp_path):
     with pytest.raises(DatasetError, match=r"build\.json: does not say"):
         list(sizes_of([tmp_path], IntraCoding()))
     write_png(built / "eval" / "images" / "000002.png", np.zeros((8, 8, 3), np.uint8))

@@ -8,7 +8,6 @@ import pytest
 from rich.console import Console
 
 from lab.latency import EvalLatency
-from lab.latency.report import write_latency_figures
 from lab.latency.run import (
     FRAMES_FOR_REQUIREMENT,
     REQUIREMENT,
@@ -19,8 +18,6 @@ from lab.latency.run import (
 from rfcore.errors import InvalidInput
 from rfcore.link.plan import DirectionPlan
 from rfcore.link.shaper import LinkProfile
-
-SAMPLES = Path(__file__).parents[2] / "samples"
 
 
 def constant(rate_bps, delay_s=0.0):
@@ -171,32 +168,6 @@ def test_from_capture_to_shown_takes_longer_than_the_link_alone(latency):
         assert 0 < shown["sender_busy_percent"] < 100
         if shown["dropped"] == played["dropped"] == 0:
             assert shown["sent_ms"]["mean"] > played["network_ms"]["mean"]
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_a_quick_run_writes_rows_and_figures(tmp_path):
-    drive = SAMPLES / "street/transforms_drive_empty.json"
-    job = EvalLatency(
-        drives=(f"empty@10={drive}",),
-        effort="fast",
-        preset="ultrafast",
-        quality_db=32.0,
-        out=tmp_path / "latency.json",
-        cells=tmp_path / "cells",
-        quick=True,
-    )
-    result = run_latency(job, Console(quiet=True))
-    assert json.loads(job.out.read_text()) == result
-    ours, theirs = result["needed"]
-    assert ours["method"].startswith("rfedge")
-    for row in (ours, theirs):
-        assert 32.0 <= row["psnr_db"] < 33.0
-    assert ours["kbit_per_frame"] < theirs["kbit_per_frame"]
-    assert ours["uplink_bps_p99_within"]["10"] < theirs["uplink_bps_p99_within"]["10"]
-    paths = write_latency_figures(result, tmp_path / "figures", "latency")
-    assert len(paths) == 6
-    assert all(path.stat().st_size for path in paths)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Live measurements: what is asked for is checked before anything starts."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,13 +20,11 @@ from rfcore.errors import InvalidInput
         ({"out": Path("live.txt")}, "must end in .json"),
     ],
 )
-def test_what_cannot_be_measured_is_refused_before_anything_starts(
-    change: dict[str, Any], problem: str
-) -> None:
+def test_what_cannot_be_measured_is_refused_before_anything_starts(change, problem):
     with pytest.raises(InvalidInput, match=problem):
         EvalLive(**change)
 
 
-def test_percentiles_of_nothing_are_none() -> None:
+def test_percentiles_of_nothing_are_none():
     assert percentiles([]) == (None, None)
     assert percentiles([float(ms) for ms in range(101)]) == (50.0, 99.0)

@@ -20,9 +20,7 @@ def recorded(path: Path, *runs: Run) -> list[RecordedLoad]:
     return rows_of(RecordedLoad, read_result(path, "loadtest")["rows"])
 
 
-def test_a_recorded_row_is_replaced_by_the_same_load_and_kept_beside_others(
-    tmp_path: Path,
-) -> None:
+def test_a_recorded_row_is_replaced_by_the_same_load_and_kept_beside_others(tmp_path):
     path = tmp_path / "loadtest.json"
     recorded(path, load_run(4, held=False, mode=Mode.FULL))
     recorded(path, load_run(4, held=True, mode=Mode.FULL))
@@ -36,7 +34,7 @@ def test_a_recorded_row_is_replaced_by_the_same_load_and_kept_beside_others(
     assert all(row.command and row.revision for row in rows), "each says how it was made"
 
 
-def test_runs_of_one_load_are_rows_of_their_own_and_replace_those_before(tmp_path: Path) -> None:
+def test_runs_of_one_load_are_rows_of_their_own_and_replace_those_before(tmp_path):
     one = load_run(8, held=True)
     for on_time in (90.0, 99.5):
         rows = [replace(one.row, run=n, on_time_percent=on_time + n / 10) for n in (1, 2, 3)]
@@ -44,7 +42,7 @@ def test_runs_of_one_load_are_rows_of_their_own_and_replace_those_before(tmp_pat
     assert [(row.run, row.on_time_percent) for row in kept] == [(1, 99.6), (2, 99.7), (3, 99.8)]
 
 
-def test_rows_are_not_recorded_in_another_kind_of_file(tmp_path: Path) -> None:
+def test_rows_are_not_recorded_in_another_kind_of_file(tmp_path):
     path = tmp_path / "compare.json"
     made = Provenance("rfedge eval compare", "abc123", False, {"cpu": "C"}, {})
     write_result(path, make_result("compare", made, {"rows": []}))
@@ -54,7 +52,7 @@ def test_rows_are_not_recorded_in_another_kind_of_file(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_the_command_records_what_a_load_test_wrote(tmp_path: Path) -> None:
+def test_the_command_records_what_a_load_test_wrote(tmp_path):
     write_load_result(LoadResult([load_run(4, held=True)]), tmp_path)
     arguments = [str(tmp_path / name) for name in ("kept.json", "result.json")]
     assert main(arguments) == 0

@@ -19,7 +19,7 @@ def pose(x: float, yaw: float) -> Pose:
     return Pose((x, 0.1 * x, 2.0), quaternion_from_vector((0.0, yaw, 0.02)))
 
 
-def test_every_key_is_taken() -> None:
+def test_every_key_is_taken():
     given = GivenDrive.parse("a=d.json,f.rff,units=2,hz=5,frames=9,noise=3,rows=bits")
     assert (given.name, given.drive, given.field) == ("a", Path("d.json"), Path("f.rff"))
     assert (given.units, given.hz, given.frames, given.noise) == (2.0, 5.0, 9, 3.0)
@@ -41,12 +41,12 @@ def test_every_key_is_taken() -> None:
         "a=d.json,f.rff,feed=p.txt",
     ],
 )
-def test_other_text_is_refused(text: str) -> None:
+def test_other_text_is_refused(text):
     with pytest.raises(InvalidInput, match=r"drives|start_error: '2m' is not"):
         GivenDrive.parse(text)
 
 
-def test_a_feed_in_other_axes_is_put_where_the_map_lies_and_keeps_its_drift() -> None:
+def test_a_feed_in_other_axes_is_put_where_the_map_lies_and_keeps_its_drift():
     truth = [pose(float(n), 0.1 * n) for n in range(6)]
     axes = Pose((5.0, -3.0, 1.0), quaternion_from_vector((0.3, -1.0, 0.4)))
     known = [axes.compose(p) for p in truth]
@@ -57,12 +57,12 @@ def test_a_feed_in_other_axes_is_put_where_the_map_lies_and_keeps_its_drift() ->
     assert abs(off.rotation[0]) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_a_map_with_another_number_of_poses_is_refused() -> None:
+def test_a_map_with_another_number_of_poses_is_refused():
     with pytest.raises(InvalidInput, match="2 poses for 1 pictures"):
         aligned_poses([], [pose(0, 0), pose(1, 0)], [pose(0, 0)])
 
 
-def test_pose_lines_are_read_and_others_refused(tmp_path: Path) -> None:
+def test_pose_lines_are_read_and_others_refused(tmp_path):
     path = tmp_path / "poses.txt"
     path.write_text("1 0 0 4 0 1 0 5 0 0 1 6\n0 -1 0 0 1 0 0 0 0 0 1 0\n")
     first, second = read_pose_lines(path)
@@ -74,7 +74,7 @@ def test_pose_lines_are_read_and_others_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.sample
-def test_noise_has_the_deviation_asked_for_and_is_the_same_each_time() -> None:
+def test_noise_has_the_deviation_asked_for_and_is_the_same_each_time():
     drive = SAMPLES / "street/transforms_drive_empty.json"
     plain, noisy = (
         GivenDrive("a", drive, SAMPLES / "fields/street.rff", noise=sigma).read(1)[1][0]

@@ -24,7 +24,7 @@ SAMPLES = Path(__file__).parents[2] / "samples"
 
 @pytest.mark.sample
 @pytest.mark.slow
-def test_the_sample_gives_a_row_of_starts_and_a_row_of_bits(tmp_path: Path) -> None:
+def test_the_sample_gives_a_row_of_starts_and_a_row_of_bits(tmp_path):
     drive = SAMPLES / "street/transforms_drive_empty.json"
     field = SAMPLES / "fields/street.rff"
     EvalLocalise(
@@ -49,8 +49,8 @@ def test_the_sample_gives_a_row_of_starts_and_a_row_of_bits(tmp_path: Path) -> N
 
 @pytest.mark.sample
 def test_a_row_that_is_there_is_not_measured_again_and_any_other_setting_is_another_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     text = f"a={SAMPLES / 'street/transforms_drive_empty.json'},{SAMPLES / 'fields/street.rff'}"
     elsewhere = SAMPLES / "street/transforms_drive_vehicles.json"
     asked = EvalLocalise(
@@ -82,7 +82,7 @@ def test_a_row_that_is_there_is_not_measured_again_and_any_other_setting_is_anot
 
 
 @pytest.mark.sample
-def test_pictures_of_other_places_of_any_size_are_every_second_false_start() -> None:
+def test_pictures_of_other_places_of_any_size_are_every_second_false_start():
     field = load_field(SAMPLES / "fields/street.rff", threads=1)
     picture = read_dataset(SAMPLES / "street/transforms_drive_empty.json").pictures[0]
     reads = []
@@ -98,7 +98,7 @@ def test_pictures_of_other_places_of_any_size_are_every_second_false_start() -> 
     assert len(reads) == 1
 
 
-def test_a_row_counts_right_poses_of_tries_and_wrong_ones_of_all() -> None:
+def test_a_row_counts_right_poses_of_tries_and_wrong_ones_of_all():
     def ended(error_m: float | None, right: bool = False) -> SearchOutcome:
         return SearchOutcome(None, None, None, error_m, error_m, right, 300.0, 250.0)
 
@@ -109,12 +109,12 @@ def test_a_row_counts_right_poses_of_tries_and_wrong_ones_of_all() -> None:
     assert (row.median_m, row.false_cpu_ms) == (0.004, 250.0)
 
 
-def test_a_drive_may_ask_for_searches_from_one_start_error_alone() -> None:
+def test_a_drive_may_ask_for_searches_from_one_start_error_alone():
     asked = EvalLocalise(drives=("a=d.json,f.rff",), starts=("2m:3deg", "4m:8deg"))
     (wanted,) = rows_asked_for(asked, [GivenDrive.parse("a=d.json,f.rff,rows=1m:2deg")])
     assert (wanted.start, wanted.sensor) == (StartError(1, 2), None)
 
 
-def test_a_drive_without_a_field_is_refused() -> None:
+def test_a_drive_without_a_field_is_refused():
     with pytest.raises(InvalidInput, match="NAME=DRIVE,FIELD"):
         EvalLocalise(drives=("sample=here",)).run()

@@ -59,7 +59,7 @@ def sample(tmp_path: Path) -> Path:
     return folder
 
 
-def test_drives_are_lossless_and_training_views_nearly(built: Path, sample: Path) -> None:
+def test_drives_are_lossless_and_training_views_nearly(built, sample):
     pack_sample(built, sample)
     for name in ("empty", "vehicles"):
         drive = read_dataset(sample / f"transforms_drive_{name}.json")
@@ -73,7 +73,7 @@ def test_drives_are_lossless_and_training_views_nearly(built: Path, sample: Path
     np.testing.assert_allclose(train.pictures[1].read(), picture(1), atol=3)
 
 
-def test_the_manifest_lists_everything_and_says_what_rendered_it(built: Path, sample: Path) -> None:
+def test_the_manifest_lists_everything_and_says_what_rendered_it(built, sample):
     pack_sample(built, sample)
     verify_manifest(sample)
     manifest = json.loads((sample / "manifest.json").read_bytes())
@@ -81,16 +81,14 @@ def test_the_manifest_lists_everything_and_says_what_rendered_it(built: Path, sa
     assert {"README.md", "train/002.jpg", "drive_empty/001.webp"} <= manifest["sha256"].keys()
 
 
-def test_pictures_of_an_earlier_packing_do_not_stay(built: Path, sample: Path) -> None:
+def test_pictures_of_an_earlier_packing_do_not_stay(built, sample):
     (sample / "train").mkdir()
     (sample / "train" / "900.jpg").write_bytes(b"old")
     pack_sample(built, sample)
     assert not (sample / "train" / "900.jpg").exists()
 
 
-def test_an_unfinished_build_leaves_the_sample_as_it_was(
-    built: Path, sample: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unfinished_build_leaves_the_sample_as_it_was(built, sample, capsys, monkeypatch):
     content = json.loads((built / "vehicles" / "transforms_drive.json").read_text())
     content["frames"].pop()
     (built / "vehicles" / "transforms_drive.json").write_text(json.dumps(content))
@@ -102,9 +100,7 @@ def test_an_unfinished_build_leaves_the_sample_as_it_was(
     assert [path.name for path in sample.iterdir()] == ["README.md"]
 
 
-def test_a_picture_that_cannot_be_read_leaves_the_sample_as_it_was(
-    built: Path, sample: Path
-) -> None:
+def test_a_picture_that_cannot_be_read_leaves_the_sample_as_it_was(built, sample):
     pack_sample(built, sample)
     before = {path: path.read_bytes() for path in sample.rglob("*") if path.is_file()}
     (built / "vehicles" / "drive" / "000001.png").write_bytes(b"no picture")
@@ -113,7 +109,7 @@ def test_a_picture_that_cannot_be_read_leaves_the_sample_as_it_was(
     assert {path: path.read_bytes() for path in sample.rglob("*") if path.is_file()} == before
 
 
-def test_both_scenes_of_the_sample_are_one_street_and_one_drive() -> None:
+def test_both_scenes_of_the_sample_are_one_street_and_one_drive():
     empty, vehicles = (load_scene(str(SAMPLE / f"{name}.toml")) for name in ("empty", "vehicles"))
     assert (vehicles.geometry, vehicles.rig, vehicles.drive) == (
         empty.geometry,

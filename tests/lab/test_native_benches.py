@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -42,7 +41,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_device_is_named_with_its_driver_beside_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_is_named_with_its_driver_beside_the_cpu(monkeypatch):
     monkeypatch.setattr(raster, "street_gaussians", lambda: street_gaussians(1000))
     monkeypatch.setattr(raster, "OPENCL_SIZES_PX", ((30, 20), (48, 32)))
     rows = run_case("raster", isa=OPENCL)["rows"]
@@ -52,7 +51,7 @@ def test_a_device_is_named_with_its_driver_beside_the_cpu(monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_a_device_that_draws_other_bytes_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_that_draws_other_bytes_is_not_timed(monkeypatch):
     monkeypatch.setattr(raster, "street_gaussians", lambda: street_gaussians(1000))
     render = Rasterizer.render
 
@@ -66,7 +65,7 @@ def test_a_device_that_draws_other_bytes_is_not_timed(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.usefixtures("small")
-def test_raster_rows_have_the_published_keys_and_null_where_not_run() -> None:
+def test_raster_rows_have_the_published_keys_and_null_where_not_run():
     rows = run_case("raster", rows="all")["rows"]
     assert [list(row) for row in rows] == [RASTER_KEYS] * 4
     assert [(row["width"], row["threads"]) for row in rows] == [(30, 1), (30, 2), (48, 1), (48, 2)]
@@ -78,9 +77,7 @@ def test_raster_rows_have_the_published_keys_and_null_where_not_run() -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_a_result_says_where_it_came_from_and_survives_json(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_result_says_where_it_came_from_and_survives_json(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(train, "street_gaussians", lambda count=1000: street_gaussians(count))
     result = run_case("train")
     assert [list(row) for row in result["rows"]] == [TRAIN_KEYS] * 2
@@ -94,24 +91,22 @@ def test_a_result_says_where_it_came_from_and_survives_json(
     assert "iteration" in capsys.readouterr().out
 
 
-def test_a_wrong_renderer_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_renderer_is_not_timed(monkeypatch):
     class Wrong(Rasterizer):
         def render_colour(self, camera: object) -> F32:
-            return super().render_colour(camera) + 1e-3  # type: ignore[arg-type]
+            return super().render_colour(camera) + 1e-3
 
     monkeypatch.setattr(raster, "Rasterizer", Wrong)
     with pytest.raises(RfedgeError, match="nothing was timed"):
         raster.check_against_reference(street_gaussians(500), street_camera(20, 12))
 
 
-def test_an_unknown_case_is_refused_by_name() -> None:
+def test_an_unknown_case_is_refused_by_name():
     with pytest.raises(InvalidInput, match="'speed' is not one of raster, train, codec"):
         run_case("speed")
 
 
-def test_every_coder_has_its_row_at_each_number_of_references(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_every_coder_has_its_row_at_each_number_of_references(monkeypatch):
     monkeypatch.setattr(codec, "street_gaussians", lambda: street_gaussians(2000))
     monkeypatch.setattr(codec, "SIZES_PX", ((64, 48),))
     monkeypatch.setattr(codec, "THREADS", (2,))

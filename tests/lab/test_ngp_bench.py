@@ -39,7 +39,7 @@ def numbers() -> NgpParameters:
     return found
 
 
-def test_a_row_has_the_published_keys(numbers: NgpParameters) -> None:
+def test_a_row_has_the_published_keys(numbers):
     renderer = NgpRenderer(numbers, threads=2)
     unhurried, hurried = (ngp._row(renderer, CAMERA, n, (25.0, 1e3)) for n in (None, 4))
     assert list(as_json(unhurried)) == list(as_json(hurried)) == KEYS
@@ -51,9 +51,7 @@ def test_a_row_has_the_published_keys(numbers: NgpParameters) -> None:
     assert hurried.frame_ms > 0
 
 
-def test_a_wrong_renderer_is_not_timed(
-    numbers: NgpParameters, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_renderer_is_not_timed(numbers, monkeypatch):
     class Wrong(NgpRenderer):
         def render_colour(self, camera: Camera, samples_per_ray: int | None = None) -> F32:
             return super().render_colour(camera, samples_per_ray) + np.float32(1e-3)
@@ -64,6 +62,6 @@ def test_a_wrong_renderer_is_not_timed(
         ngp.check_against_reference(numbers, CAMERA)
 
 
-def test_a_field_of_splats_is_not_a_hash_grid() -> None:
+def test_a_field_of_splats_is_not_a_hash_grid():
     with pytest.raises(InvalidInput, match="holds splats; give one of kind ngp"):
         ngp.ngp_rows(Path("samples/fields/street.rff"))

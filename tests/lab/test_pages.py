@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -28,7 +27,7 @@ def results() -> Recorded:
     return recorded()
 
 
-def test_every_recorded_result_renders_in_tables_that_fit_a_screen(results: Recorded) -> None:
+def test_every_recorded_result_renders_in_tables_that_fit_a_screen(results):
     made = pages(results, {})
     for kind, named in results.items():
         page = made[kind]
@@ -44,9 +43,7 @@ def test_every_recorded_result_renders_in_tables_that_fit_a_screen(results: Reco
 
 
 @pytest.mark.slow
-def test_the_committed_pages_and_figures_are_those_of_the_results(
-    results: Recorded, tmp_path: Path
-) -> None:
+def test_the_committed_pages_and_figures_are_those_of_the_results(results, tmp_path):
     drawn = write_figures(results, tmp_path)
     for name, page in pages(results, drawn).items():
         assert (RESULTS / f"{name}.md").read_text() == page, "run `make figures`"
@@ -57,7 +54,7 @@ def test_the_committed_pages_and_figures_are_those_of_the_results(
             assert committed.read_text() == path.read_text(), "run `make figures`"
 
 
-def test_the_readme_gets_three_drives_and_the_loss_between_its_marks(results: Recorded) -> None:
+def test_the_readme_gets_three_drives_and_the_loss_between_its_marks(results):
     page = with_headline(f"before\n{README_BEGINS}\nold\n{README_ENDS}\nafter\n", results)
     assert page.startswith(f"before\n{README_BEGINS}\n")
     assert page.endswith(f"{README_ENDS}\nafter\n")
@@ -68,7 +65,7 @@ def test_the_readme_gets_three_drives_and_the_loss_between_its_marks(results: Re
         with_headline("# A page\n", results)
 
 
-def test_a_kind_that_nothing_shows_is_refused(tmp_path: Path) -> None:
+def test_a_kind_that_nothing_shows_is_refused(tmp_path):
     (tmp_path / "x.json").write_text(json.dumps({"kind": "weather"}))
     with pytest.raises(InvalidInput, match=r"x\.json: nothing shows kind 'weather'"):
         recorded(tmp_path)
@@ -77,14 +74,14 @@ def test_a_kind_that_nothing_shows_is_refused(tmp_path: Path) -> None:
 ROW = FaultRow("it breaks", "a hammer", "back <= 1 s; told so", "2.5 s; yes", passed=False)
 
 
-def test_a_fault_that_does_not_hold_stands_out_with_each_bound_beside_its_figure() -> None:
+def test_a_fault_that_does_not_hold_stands_out_with_each_bound_beside_its_figure():
     score, *_, shown = FAULTS.parts({"rows": as_json([ROW])})
     assert score == "0 of 1 hold."
     assert "it breaks: **does not hold**" in shown
     assert "| back <= 1 s | 2.5 s |\n| told so | yes |" in str(shown)
 
 
-def test_a_bound_without_its_figure_is_refused() -> None:
+def test_a_bound_without_its_figure_is_refused():
     row: dict[str, Any] = {**as_json(ROW), "measured": "2.5 s"}
     with pytest.raises(InvalidInput, match="2 bounds and 1 figures"):
         list(FAULTS.parts({"rows": [row]}))

@@ -2,14 +2,13 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from lab.paper import EvalPaper, run
+from lab.paper import EvalPaper
 from lab.paper.figures import write_paper_figures, write_views
 from lab.paper.report import (
     PaperRow,
@@ -20,7 +19,6 @@ from lab.paper.report import (
 )
 from lab.paper.run import named_path, run_paper, views_of
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.savings import intra_alone
 from rfedge.results import as_json
 
 
@@ -153,57 +151,6 @@ def paper(thumbnail, tmp_path_factory):
     return job, run_paper(job, Console(quiet=True))
 
 
-def test_the_camera_frame_alone_is_coded_once_for_all_fields(thumbnail, tmp_path, monkeypatch):
-    coded = []
-
-    def counted(frame, preset, crf):
-        coded.append((preset, crf))
-        return intra_alone(frame, preset, crf)
-
-    monkeypatch.setattr(run, "intra_alone", counted)
-    job = EvalPaper(
-        fields=(f"3dgs={thumbnail.field}", f"again={thumbnail.field}"),
-        drives=(f"wall={thumbnail.empty.partition('=')[2]}",),
-        sizes=("48x32",),
-        out=tmp_path / "paper.json",
-        cells=tmp_path / "cells",
-        quick=True,
-    )
-    rows = paper_rows(run_paper(job, Console(quiet=True)))
-    assert len(coded) == 2 * len(set(coded)) == 2 * 9, "of two frames"
-    bytes_of = {(r.frame, r.preset, r.crf): r.camera_i_bytes for r in rows if r.field == "3dgs"}
-    assert all(bytes_of[r.frame, r.preset, r.crf] == r.camera_i_bytes for r in rows)
-
-
-def test_a_frame_is_read_once_and_rendered_once_at_its_own_size(paper, monkeypatch):
-    job, _ = paper
-    rendered, read = [], []
-    render, read_dataset = run._render, run.read_dataset
-
-    def counted(field, camera):
-        rendered.append(camera.intrinsics.width_px)
-        return render(field, camera)
-
-    def dataset(path):
-        found = read_dataset(path)
-        pictures = [replace(p, read=partial(_noted, read, p)) for p in found.pictures]
-        return replace(found, pictures=pictures)
-
-    monkeypatch.setattr(run, "_render", counted)
-    monkeypatch.setattr(run, "read_dataset", dataset)
-    pieces = list(run._shots(job, run._opened(job)))
-    for piece in pieces:
-        assert list(run._rows(piece))
-    frames = {piece.source.picture.name for piece in pieces}
-    assert sorted(read) == sorted(frames)
-    assert rendered.count(96) == len(frames)
-
-
-def _noted(read, picture):
-    read.append(picture.name)
-    return picture.read()
-
-
 def test_every_frame_is_coded_at_every_setting_with_both_controls_beside_the_smaller_size(paper):
     _, result = paper
     rows = paper_rows(result)
@@ -274,13 +221,6 @@ def test_the_first_frame_of_each_drive_is_shown_as_camera_and_field_see_it(paper
 def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
     with pytest.raises(InvalidInput, match=named):
         EvalPaper(**({"fields": ("a=b",), "drives": ("c=d",)} | change))
-
-
-def test_a_scene_that_was_not_published_has_a_plain_name(tmp_path):
-    paths = write_paper_figures(
-        result_of([replace(r, scene="night") for r in ROWS]), tmp_path, "paper"
-    )
-    assert "savings_night_3dgs.svg" in {path.name for path in paths}
 
 
 def test_views_stand_side_by_side(tmp_path):

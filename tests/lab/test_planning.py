@@ -33,7 +33,7 @@ def planned(folder: Path, **changes: Any) -> PlannedLoad:
     return replace(job, **changes)
 
 
-def test_cores_and_bytes_are_those_of_the_frames(tmp_path: Path) -> None:
+def test_cores_and_bytes_are_those_of_the_frames(tmp_path):
     twelve, more = (planned_figures(planned(tmp_path), COSTS, 0.01, n) for n in (12, 48))
     assert twelve.cores == pytest.approx(0.01 + 12 * 3 * 0.004)
     assert twelve.uplink_mbps == pytest.approx(12 * 3 * 800 * 8e-6)
@@ -42,14 +42,12 @@ def test_cores_and_bytes_are_those_of_the_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("vehicles", [(), (0,), (12, 1001), (FIT_VEHICLES[0],)])
-def test_numbers_that_cannot_be_planned_are_refused(
-    tmp_path: Path, vehicles: tuple[int, ...]
-) -> None:
+def test_numbers_that_cannot_be_planned_are_refused(tmp_path, vehicles):
     with pytest.raises(InvalidInput, match="planned"):
         planned(tmp_path, vehicles=vehicles)
 
 
-def test_a_load_without_a_cost_is_refused(tmp_path: Path) -> None:
+def test_a_load_without_a_cost_is_refused(tmp_path):
     few, more = (LoadFigures(n, 0.5, 1.0, 60.0, (60.0,)) for n in FIT_VEHICLES)
     with pytest.raises(InvalidInput, match="measure again"):
         fitted_costs(planned(tmp_path), few, more)
@@ -58,7 +56,7 @@ def test_a_load_without_a_cost_is_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.timeout(300)
-def test_a_small_load_is_compared_with_its_plan(tmp_path: Path) -> None:
+def test_a_small_load_is_compared_with_its_plan(tmp_path):
     """Bytes do not depend on the machine; cores and ages do, so that only their rows are asked
     for."""
     fields = tmp_path / "fields"
@@ -86,6 +84,6 @@ def test_a_small_load_is_compared_with_its_plan(tmp_path: Path) -> None:
     assert rows["planned 12 vehicles: uplink_mbps, % off"].held
 
 
-def test_nothing_to_measure_is_refused(tmp_path: Path) -> None:
+def test_nothing_to_measure_is_refused(tmp_path):
     with pytest.raises(InvalidInput, match="nothing is to be measured"):
         run_scale(EvalScale(envoy=False, work=tmp_path / "work"), Console(quiet=True))

@@ -30,7 +30,7 @@ RUN = TileRun(
 )
 
 
-def test_a_runs_lines_say_how_long_and_where_it_worked() -> None:
+def test_a_runs_lines_say_how_long_and_where_it_worked():
     assert RUN.cores == 2
     assert RUN.work_s == (4.5, 5.25)
     assert RUN.seconds == 6.0
@@ -50,13 +50,13 @@ def test_a_runs_lines_say_how_long_and_where_it_worked() -> None:
     ],
     ids=["not killed", "begun anew", "from the beginning", "one worker"],
 )
-def test_a_tile_that_did_not_go_on_in_another_worker_is_an_error(run: TileRun) -> None:
+def test_a_tile_that_did_not_go_on_in_another_worker_is_an_error(run):
     require_resumed(RUN, "tile-0-0")
     with pytest.raises(RfedgeError, match="workers of tile-0-0 were killed at 50 %"):
         require_resumed(run, "tile-0-0")
 
 
-def test_a_run_without_ray_has_no_cores() -> None:
+def test_a_run_without_ray_has_no_cores():
     with pytest.raises(RfedgeError, match="of no Ray"):
         TileRun(RUN.lines[1:], RUN.times_s[1:], 0).cores  # noqa: B018
 
@@ -72,19 +72,19 @@ def test_a_run_without_ray_has_no_cores() -> None:
     ],
 )
 def test_overhead_is_what_comes_on_top_of_workers_that_are_never_idle(
-    seconds: float, work_s: tuple[float, ...], workers: int, percent: float
-) -> None:
+    seconds, work_s, workers, percent
+):
     assert overhead_percent(seconds, work_s, workers) == pytest.approx(percent)
 
 
-def test_no_work_has_no_overhead() -> None:
+def test_no_work_has_no_overhead():
     with pytest.raises(InvalidInput, match="0 jobs on 2 workers"):
         overhead_percent(1.0, (), 2)
     with pytest.raises(InvalidInput, match="1 jobs on 0 workers"):
         overhead_percent(1.0, (1.0,), 0)
 
 
-def test_a_folder_without_tiles_is_refused_before_anything_runs(tmp_path: Path) -> None:
+def test_a_folder_without_tiles_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(InvalidInput, match=r"ray_tiles: .* has no tiles\.json"):
         ray_case(tmp_path, 100)
 
@@ -98,7 +98,7 @@ def write_list(folder: Path, tiles: int) -> None:
     (folder / "tiles.json").write_text(json.dumps({"tiles": listed}))
 
 
-def test_fewer_than_three_tiles_or_ten_iterations_are_refused(tmp_path: Path) -> None:
+def test_fewer_than_three_tiles_or_ten_iterations_are_refused(tmp_path):
     write_list(tmp_path, 2)
     with pytest.raises(InvalidInput, match="has 2 tiles, the case takes 3"):
         ray_case(tmp_path, 100)
@@ -107,9 +107,7 @@ def test_fewer_than_three_tiles_or_ten_iterations_are_refused(tmp_path: Path) ->
         ray_case(tmp_path, 9)
 
 
-def test_the_rows_say_which_tiles_they_are_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_rows_say_which_tiles_they_are_of(tmp_path, monkeypatch):
     """Training is replaced by files and the lines of a run."""
     write_list(tmp_path, 3)
     asked = []
@@ -121,7 +119,7 @@ def test_the_rows_say_which_tiles_they_are_of(
         return RUN
 
     monkeypatch.setattr("lab.servers.ray.train_tiles", train)
-    measured = ray_case(tmp_path, 600)(SimpleNamespace(work=tmp_path / "work"))  # type: ignore[arg-type]
+    measured = ray_case(tmp_path, 600)(SimpleNamespace(work=tmp_path / "work"))
     assert asked == [
         (tmp_path, "alone", "60", None, None),
         (tmp_path, "on-ray", "60", "local", None),

@@ -26,7 +26,7 @@ def shown(camera_id: str, instant: int, captured_ms: int = 0, age_ms: int = 0) -
     )
 
 
-def test_the_spread_of_an_instant_is_from_its_first_to_its_last_picture() -> None:
+def test_the_spread_of_an_instant_is_from_its_first_to_its_last_picture():
     pictures = [
         shown("a", 1, 100, 30),
         shown("b", 1, 100, 75),
@@ -39,7 +39,7 @@ def test_the_spread_of_an_instant_is_from_its_first_to_its_last_picture() -> Non
     assert spread.milliseconds == pytest.approx((45.0, 10.0))
 
 
-def test_instants_apart_counts_once_every_camera_has_shown_one() -> None:
+def test_instants_apart_counts_once_every_camera_has_shown_one():
     pictures = [shown("a", 1), shown("a", 2), shown("b", 2), shown("a", 3), shown("b", 3)]
     assert instants_apart(pictures, 2) == 1
     assert instants_apart([*pictures, shown("a", 4), shown("a", 5)], 2) == 2

@@ -1,7 +1,6 @@
 """What is read from vehicles' reports, and the cases once, with few small vehicles."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -35,7 +34,7 @@ def sent(at_s: float, way_ms: float, result: str = "acked") -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("way_ms", "held"), [(58.0, True), (58.5, False)])
-def test_frames_may_take_little_longer_while_nats_is_away(way_ms: float, held: bool) -> None:
+def test_frames_may_take_little_longer_while_nats_is_away(way_ms, held):
     told = [
         [sent(9.0, 900.0), sent(10.0, 40.0), sent(12.0, way_ms), sent(15.0, 900.0)],
         [sent(11.0, 30.0), sent(11.5, 900.0, "lost"), sent(13.0, 20.0)],
@@ -45,12 +44,12 @@ def test_frames_may_take_little_longer_while_nats_is_away(way_ms: float, held: b
     assert (row.measured, row.held) == (pytest.approx(way_ms), held)
 
 
-def test_without_frames_before_nothing_is_compared() -> None:
+def test_without_frames_before_nothing_is_compared():
     with pytest.raises(InvalidInput, match="nothing"):
         undisturbed([[sent(12.0, 40.0)]], 10 * S, 12 * S, 15 * S)
 
 
-def test_a_vehicle_is_back_with_the_first_ack_on_another_stream() -> None:
+def test_a_vehicle_is_back_with_the_first_ack_on_another_stream():
     lines = [
         *(line(9.0, 1), line(9.9, 1)),
         line(10.1, 1, "lost"),
@@ -60,18 +59,18 @@ def test_a_vehicle_is_back_with_the_first_ack_on_another_stream() -> None:
     assert resumed_s(lines, 10 * S) == pytest.approx(0.5)
 
 
-def test_a_vehicle_that_kept_its_stream_is_not_back() -> None:
+def test_a_vehicle_that_kept_its_stream_is_not_back():
     assert resumed_s([line(9.0, 1), line(10.1, 1), line(10.3, 1)], 10 * S) is None
     assert resumed_s([line(9.0, 1), line(10.1, 2, "lost")], 10 * S) is None
 
 
-def test_pictures_that_nobody_sent_are_no_failures() -> None:
+def test_pictures_that_nobody_sent_are_no_failures():
     results = ("acked", "lost", "nacked", "dropped", "lost", "lost")
     lines = [line(at_s, 1, result) for at_s, result in enumerate(results)]
     assert failures(lines, 1 * S, 5 * S) == 3
 
 
-def test_a_keyframe_is_an_acknowledged_picture_without_the_render() -> None:
+def test_a_keyframe_is_an_acknowledged_picture_without_the_render():
     alone = {"references": ["previous"]}
     lines = [line(0, 1), line(1, 1, **alone), line(2, 1, "lost", **alone)]
     assert keyframes(lines) == 1
@@ -94,27 +93,25 @@ def shown(text: str, vehicle: str = "cav", camera: str = "front") -> list[ShownP
     ],
     ids=["stays", "old frames end late", "told again", "one at both", "back and forth", "old goes"],
 )
-def test_a_vehicle_that_moves_is_shown_once_by_the_time_its_pictures_were_taken(
-    text: str, twice: int
-) -> None:
+def test_a_vehicle_that_moves_is_shown_once_by_the_time_its_pictures_were_taken(text, twice):
     assert shown_twice(shown(text)) == twice
 
 
-def test_vehicles_that_are_shown_twice_are_counted_once_and_cameras_are_apart() -> None:
+def test_vehicles_that_are_shown_twice_are_counted_once_and_cameras_are_apart():
     good = shown("1a 2a", "x", "left") + shown("1b 2b", "x", "right")
     assert shown_twice(good) == 0
     bad = shown("1a 1b", "y", "left") + shown("1a 1b", "y", "right") + shown("1a 1b", "z")
     assert shown_twice(good + bad) == 2
 
 
-def test_a_percentile_of_few_values_is_the_largest_and_of_none_an_error() -> None:
+def test_a_percentile_of_few_values_is_the_largest_and_of_none_an_error():
     assert p99([0.1, 0.7, 0.3]) == 0.7
     assert p99(range(1, 201)) == 198
     with pytest.raises(InvalidInput, match="nothing"):
         p99([])
 
 
-def test_a_row_is_held_up_to_its_bound() -> None:
+def test_a_row_is_held_up_to_its_bound():
     assert ScaleRow.at_most("a", 1.5, 1.5).held
     assert not ScaleRow.at_most("a", 1.5, 1.51).held
 
@@ -122,13 +119,13 @@ def test_a_row_is_held_up_to_its_bound() -> None:
 @pytest.mark.parametrize(
     "changes", [{"vehicles": 1}, {"servers": 1}, {"rounds": 0}, {"pairs": -1}, {"seconds": 0.0}]
 )
-def test_what_cannot_be_run_is_refused(changes: dict[str, Any]) -> None:
+def test_what_cannot_be_run_is_refused(changes):
     (name,) = changes
     with pytest.raises(InvalidInput, match=name):
         EvalScale(**changes)
 
 
-def test_behind_envoy_there_is_something_to_measure() -> None:
+def test_behind_envoy_there_is_something_to_measure():
     with pytest.raises(InvalidInput, match="nothing is to be measured"):
         cases_of(EvalScale(moves=False, pairs=0))
     assert cases_of(EvalScale(moves=False, pairs=2)) == [added_by_envoy]
@@ -146,7 +143,7 @@ def rows(**measured: float) -> list[ScaleRow]:
     return [ScaleRow.at_most(case, 2.0, value) for case, value in measured.items()]
 
 
-def test_a_case_measured_again_replaces_its_row_and_leaves_its_earlier_run(tmp_path: Path) -> None:
+def test_a_case_measured_again_replaces_its_row_and_leaves_its_earlier_run(tmp_path):
     out = tmp_path / "scale.json"
     plan = PlannedRow(12, "cores", 1.0, 2.0, -50.0)
     tiles = RayTiles(3, "ab", 600)
@@ -161,19 +158,19 @@ def test_a_case_measured_again_replaces_its_row_and_leaves_its_earlier_run(tmp_p
     assert (read.planning, read.envoy_added_ms, read.ray) == ([plan], [0.5, 1.5], [tiles])
 
 
-def test_groups_of_one_run_are_one_run() -> None:
+def test_groups_of_one_run_are_one_run():
     record = ScaleRecord()
     for case in ("x", "y"):
         record = record.plus(made(), Measured(rows(**{case: 1.0})))
     assert record.runs == [ScaleRun("rfedge-lab scale", "abc", ["x", "y"])]
 
 
-def test_a_run_without_rows_left_is_forgotten() -> None:
+def test_a_run_without_rows_left_is_forgotten():
     record = ScaleRecord().plus(made("a"), Measured(rows(x=1.0)))
     assert [run.command for run in record.plus(made("b"), Measured(rows(x=1.0))).runs] == ["b"]
 
 
-def test_rows_of_another_host_or_input_are_not_added_to(tmp_path: Path) -> None:
+def test_rows_of_another_host_or_input_are_not_added_to(tmp_path):
     out = tmp_path / "scale.json"
     ScaleRecord().plus(made(), Measured(rows(x=1.0))).write(out, made())
     with pytest.raises(InvalidInput, match=r"measured on .*'cores': 2.* not .*'cores': 4"):
@@ -182,9 +179,7 @@ def test_rows_of_another_host_or_input_are_not_added_to(tmp_path: Path) -> None:
         ScaleRecord.read(out, replace(made(), inputs={"street.rff": "00"}))
 
 
-def test_a_run_that_breaks_off_keeps_what_it_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_breaks_off_keeps_what_it_measured(tmp_path, monkeypatch):
     """The case of each group is written before the next one begins."""
 
     def broken(job: EvalScale) -> Measured:
@@ -208,7 +203,7 @@ def test_a_run_that_breaks_off_keeps_what_it_measured(
     assert [row.case for row in ScaleRecord.read(out, made_here).rows] == ["x", "y"]
 
 
-def test_a_configuration_without_the_ports_to_take_is_refused(tmp_path: Path) -> None:
+def test_a_configuration_without_the_ports_to_take_is_refused(tmp_path):
     config = tmp_path / "other.yaml"
     config.write_text("port_value: 9901\n")
     with pytest.raises(InvalidInput, match="must say `port_value: 50050` once"):

@@ -8,7 +8,7 @@ from rfcore.codec.sender.ladder import read_ladder
 from rfedge.results import read_result
 
 
-def test_the_file_is_made_of_the_recorded_one() -> None:
+def test_the_file_is_made_of_the_recorded_one():
     made = shipped_ladder(read_result(RECORDED, "ladder"))
     assert SHIPPED_LADDER.read_text() == made, "python -m lab.pages.ladder > cav_agent/ladder.json"
 
@@ -16,7 +16,7 @@ def test_the_file_is_made_of_the_recorded_one() -> None:
 @pytest.mark.parametrize(
     ("kind", "tracking"), [("splats", False), ("splats", True), ("ngp", False)]
 )
-def test_a_vehicle_reads_of_it_what_the_recorded_one_says(kind: str, tracking: bool) -> None:
+def test_a_vehicle_reads_of_it_what_the_recorded_one_says(kind, tracking):
     ships, recorded = (
         read_ladder(path, kind, 23.0, tracking=tracking) for path in (SHIPPED_LADDER, RECORDED)
     )

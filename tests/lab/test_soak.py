@@ -19,7 +19,7 @@ def looks(slope_mb: float = 0.0, **late: int) -> list[Sample]:
     ]
 
 
-def test_nothing_grows_when_nothing_does() -> None:
+def test_nothing_grows_when_nothing_does():
     assert what_grew(looks()) == []
     assert what_grew(looks(slope_mb=0.9)) == []
     assert what_grew(looks(descriptors=30, threads=8)) == []
@@ -34,14 +34,12 @@ def test_nothing_grows_when_nothing_does() -> None:
         (looks(children=3), "processes grew from 2 to 3"),
     ],
 )
-def test_what_grows_is_named(samples: list[Sample], said: str) -> None:
+def test_what_grows_is_named(samples, said):
     (problem,) = what_grew(samples)
     assert said in problem
 
 
-def test_a_pool_that_starts_a_thread_late_is_no_growth_and_a_leak_of_one_thread_a_quarter_is() -> (
-    None
-):
+def test_a_pool_that_starts_a_thread_late_is_no_growth_and_a_leak_of_one_thread_a_quarter_is():
     assert what_grew(looks(threads=10)) == []
     assert what_grew(looks(threads=12)) == []
     leaking = [replace(sample, threads=9 + k // 3) for k, sample in enumerate(looks() + looks())]
@@ -50,13 +48,13 @@ def test_a_pool_that_starts_a_thread_late_is_no_growth_and_a_leak_of_one_thread_
     assert what_grew(slowly) == ["threads grew from 9 to 12"]
 
 
-def test_a_thing_that_comes_and_goes_is_no_growth() -> None:
+def test_a_thing_that_comes_and_goes_is_no_growth():
     """A connection that lives for a moment, of a scrape or a check of health."""
     samples = looks()
     samples[9] = Sample(540.0, 0.0, 0.0, 200.0, 41, 9, 2)
     assert what_grew(samples) == []
 
 
-def test_a_run_too_short_for_quarters_is_judged_all_the_same() -> None:
+def test_a_run_too_short_for_quarters_is_judged_all_the_same():
     assert what_grew(looks()[:2]) == []
     assert what_grew(looks(descriptors=41)[5:8]) == ["descriptors grew from 40 to 41"]

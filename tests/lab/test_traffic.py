@@ -48,7 +48,7 @@ def written(folder: Path, text: str, name: str = "fcd.xml") -> Path:
     return path
 
 
-def test_a_trace_is_counted_by_cell(tmp_path: Path) -> None:
+def test_a_trace_is_counted_by_cell(tmp_path):
     (block,) = trace_traffic(town(), written(tmp_path, TRACE))
     assert (block.start_s, block.step_s) == (0.0, 0.5)
     assert block.vehicles.tolist() == [[1, 0, 1], [0, 1, 1], [1, 0, 1]]
@@ -57,7 +57,7 @@ def test_a_trace_is_counted_by_cell(tmp_path: Path) -> None:
     assert block.outside.tolist() == [0, 1, 1]
 
 
-def test_a_packed_trace_is_the_same(tmp_path: Path) -> None:
+def test_a_packed_trace_is_the_same(tmp_path):
     packed = tmp_path / "fcd.xml.gz"
     packed.write_bytes(gzip.compress(TRACE.encode()))
     (plain,) = trace_traffic(town(), written(tmp_path, TRACE))
@@ -65,7 +65,7 @@ def test_a_packed_trace_is_the_same(tmp_path: Path) -> None:
     assert np.array_equal(block.vehicles, plain.vehicles)
 
 
-def test_nobody_is_lost_on_the_way(tmp_path: Path) -> None:
+def test_nobody_is_lost_on_the_way(tmp_path):
     """Who is in a cell came there, began there, or was there: over every step and cell."""
     random = np.random.default_rng(3)
     points_m = random.uniform((-150, -120), (550, 120), (40, 2))
@@ -108,7 +108,7 @@ def test_nobody_is_lost_on_the_way(tmp_path: Path) -> None:
         ("</timestep>", "", "cut off"),
     ],
 )
-def test_what_is_wrong_with_a_trace_is_said(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_what_is_wrong_with_a_trace_is_said(tmp_path, old, new, said):
     assert old in TRACE
     path = written(tmp_path, TRACE.replace(old, new))
     with pytest.raises(InvalidData, match=r"fcd\.xml") as raised:
@@ -116,27 +116,27 @@ def test_what_is_wrong_with_a_trace_is_said(tmp_path: Path, old: str, new: str, 
     assert said in str(raised.value)
 
 
-def test_a_trace_that_ends_anywhere_is_refused(tmp_path: Path) -> None:
+def test_a_trace_that_ends_anywhere_is_refused(tmp_path):
     whole = TRACE.rstrip()
     for length in range(0, len(whole) - 1, 37):
         with pytest.raises(InvalidData):
             list(trace_traffic(town(), written(tmp_path, whole[:length])))
 
 
-def test_a_packed_trace_that_ends_too_soon_is_refused(tmp_path: Path) -> None:
+def test_a_packed_trace_that_ends_too_soon_is_refused(tmp_path):
     packed = tmp_path / "fcd.xml.gz"
     packed.write_bytes(gzip.compress(TRACE.encode())[:-20])
     with pytest.raises(InvalidData, match="cut off"):
         list(trace_traffic(town(), packed))
 
 
-def test_a_trace_of_another_place_is_refused(tmp_path: Path) -> None:
+def test_a_trace_of_another_place_is_refused(tmp_path):
     elsewhere = re.sub(r'x="[^"]*"', 'x="700000.0"', TRACE)
     with pytest.raises(InvalidData, match="no vehicle is in any cell"):
         list(trace_traffic(town(), written(tmp_path, elsewhere)))
 
 
-def test_cells_are_found_as_by_looking_at_all() -> None:
+def test_cells_are_found_as_by_looking_at_all():
     city = grid_city(KIND, Density((0.0, 1.0), (1.0, 1.0)), 60, 4)
     random = np.random.default_rng(5)
     cells = replace(city.cells, radius_m=random.uniform(40, 140, 60))
@@ -147,7 +147,7 @@ def test_cells_are_found_as_by_looking_at_all() -> None:
     assert (wanted >= 0).sum() > 500
 
 
-def test_a_density_is_straight_between_its_hours() -> None:
+def test_a_density_is_straight_between_its_hours():
     city = replace(town(), density=Density((7.0, 7.5), (0.0, 30.0), 0.0))
     blocks = list(stated_traffic(city))
     assert len(blocks) == 30
@@ -156,7 +156,7 @@ def test_a_density_is_straight_between_its_hours() -> None:
     assert begun == pytest.approx(30 * (1.5 + 1.0 + 0.8), rel=1e-9)
 
 
-def test_crossings_follow_the_fluid_flow_model() -> None:
+def test_crossings_follow_the_fluid_flow_model():
     """2 n v / (pi R) leave a cell; a sixth of as many come from each neighbour."""
     city = grid_city(KIND, Density((0.0, 0.1), (5.0, 5.0), 10.0), 49, 4)
     block = next(stated_traffic(city))
@@ -169,7 +169,7 @@ def test_crossings_follow_the_fluid_flow_model() -> None:
     assert block.begun_per_s[0, 0] > 0
 
 
-def test_a_city_without_demand_needs_a_trace() -> None:
+def test_a_city_without_demand_needs_a_trace():
     with pytest.raises(InvalidInput, match="--fcd"):
         next(stated_traffic(replace(town(), density=None)))
     with pytest.raises(InvalidInput, match="step-s"):

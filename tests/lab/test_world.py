@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,28 +37,26 @@ SMALL = Intrinsics(96, 54, 48.0, 48.0, 48.0, 27.0)
 @pytest.mark.parametrize(
     ("point", "outside_m"), [((1, -0.5, 9.0), 0.5), ((3, 0.5, 0), 1.0), ((1, 0.25, 0), -0.25)]
 )
-def test_a_footprint_knows_how_far_a_point_is_from_its_outline(
-    point: tuple[float, float, float], outside_m: float
-) -> None:
+def test_a_footprint_knows_how_far_a_point_is_from_its_outline(point, outside_m):
     assert SQUARE.outside_m(point) == pytest.approx(outside_m)
     assert SQUARE.distance_m(point) == pytest.approx(abs(outside_m))
 
 
-def test_aside_is_to_the_left_of_the_way() -> None:
+def test_aside_is_to_the_left_of_the_way():
     """The test's cameras look along y, with z up: their left is -x."""
     moved = aside(camera_at(), 2.0)
     assert moved.world_from_cam.translation_m == pytest.approx((-2.0, 0.0, 0.0))
     assert moved.world_from_cam.rotation == camera_at().world_from_cam.rotation
 
 
-def test_noise_has_the_strength_that_is_asked_for() -> None:
+def test_noise_has_the_strength_that_is_asked_for():
     grey = np.full((100, 100, 3), 128, np.uint8)
     rng = np.random.default_rng(1)
     assert noisy(grey, 0.0, rng) is grey
     assert noisy(grey, 3.0, rng).astype(float).std() == pytest.approx(3.0, rel=0.05)
 
 
-def test_a_live_picture_betters_the_pixels_that_changed() -> None:
+def test_a_live_picture_betters_the_pixels_that_changed():
     street = joined(STREET, car(0.8, 10.0))
     here, beside = camera_at(), camera_at(-0.5)
 
@@ -77,7 +74,7 @@ def test_a_live_picture_betters_the_pixels_that_changed() -> None:
     assert gain_of(FIELD, live, unchanged).all_db < -0.5, "the car is not there"
 
 
-def test_what_changed_is_what_the_truth_says_and_not_what_was_composed() -> None:
+def test_what_changed_is_what_the_truth_says_and_not_what_was_composed():
     """A picture that shows nothing new betters nothing, and the car counts all the same."""
     street = joined(STREET, car(0.8, 10.0))
     here, beside = camera_at(), camera_at(-0.5)
@@ -106,7 +103,7 @@ def approach(street: SplatField, vehicles: tuple[VisibleVehicle, ...]) -> Annota
 CAR = Footprint(np.float32([[-0.1, 10], [1.7, 10], [1.7, 11], [-0.1, 11]]))
 
 
-def test_what_is_followed_is_compared_with_the_vehicles_that_are_seen() -> None:
+def test_what_is_followed_is_compared_with_the_vehicles_that_are_seen():
     seen = VisibleVehicle(0, CAR, pixels=5000, nearest_m=10.0)
     hidden = replace(seen, number=1, pixels=399)
     far = replace(seen, number=2, nearest_m=30.1)
@@ -117,7 +114,7 @@ def test_what_is_followed_is_compared_with_the_vehicles_that_are_seen() -> None:
     assert found.false == set()
 
 
-def test_what_is_far_from_every_vehicle_is_false() -> None:
+def test_what_is_far_from_every_vehicle_is_false():
     elsewhere = VisibleVehicle(0, SQUARE, pixels=5000, nearest_m=2.0)
     found = followed(approach(joined(STREET, car(0.8, 10.0)), (elsewhere,)), 0.0)
     assert found.found == 0
@@ -127,7 +124,7 @@ def test_what_is_far_from_every_vehicle_is_false() -> None:
     assert followed(approach(FIELD, ()), 0.0) == FoundVehicles()
 
 
-def test_one_object_is_one_vehicle() -> None:
+def test_one_object_is_one_vehicle():
     """Two vehicles within reach of one object: it finds the nearer one."""
     near = VisibleVehicle(0, SQUARE, pixels=5000, nearest_m=9.0)
     beside = VisibleVehicle(1, Footprint(SQUARE.outline_m + np.float32([2.5, 0])), 5000, 9.0)
@@ -147,7 +144,7 @@ def test_one_object_is_one_vehicle() -> None:
     assert (two.to_find, two.found) == (2, 2)
 
 
-def test_pictures_are_looked_at_as_they_are_decoded() -> None:
+def test_pictures_are_looked_at_as_they_are_decoded():
     drive = approach(joined(STREET, car(0.8, 10.0)), ())
     sent = [picture.rgb for picture in drive.pictures]
     decoded = list(received(drive.pictures, sent))
@@ -155,7 +152,7 @@ def test_pictures_are_looked_at_as_they_are_decoded() -> None:
     assert all(0.05 < error < 4 for error in errors), "coded with loss"
 
 
-def test_the_empty_minute_is_a_minute_with_noise_of_its_own_each_time() -> None:
+def test_the_empty_minute_is_a_minute_with_noise_of_its_own_each_time():
     drive = approach(FIELD, ())
     assert drive.seconds == pytest.approx(0.6)
     longer = AnnotatedDrive(
@@ -167,7 +164,7 @@ def test_the_empty_minute_is_a_minute_with_noise_of_its_own_each_time() -> None:
 
 
 @pytest.mark.sample
-def test_dusk_is_the_same_drive_in_another_light_and_is_taught_beside_it() -> None:
+def test_dusk_is_the_same_drive_in_another_light_and_is_taught_beside_it():
     scenes = dusk_scenes("samples/street/empty.toml", "samples/street/vehicles.toml")
     assert set(scenes.empty.effects) == set(scenes.teacher.effects) == {"dusk"}
     assert set(scenes.vehicles.effects) == {"parked", "traffic", "dusk"}
@@ -188,21 +185,19 @@ def test_dusk_is_the_same_drive_in_another_light_and_is_taught_beside_it() -> No
         (10.2, 0.2, 0.2),
     ],
 )
-def test_the_age_of_a_notice_is_that_of_its_picture_when_it_arrives(
-    arrived_s: float, unseen_s: float, age_s: float
-) -> None:
+def test_the_age_of_a_notice_is_that_of_its_picture_when_it_arrives(arrived_s, unseen_s, age_s):
     """Captures every 0.2 s: what it says of its age when sent tells of which picture it is."""
     assert age_on_arrival_s(arrived_s, unseen_s, [10.0, 10.2, 10.4]) == pytest.approx(age_s)
 
 
-def test_a_notice_of_a_picture_that_was_never_taken_has_no_age() -> None:
+def test_a_notice_of_a_picture_that_was_never_taken_has_no_age():
     with pytest.raises(InvalidInput, match=r"unseen_s: 0\.5 s is before the first capture"):
         age_on_arrival_s(10.2, 0.5, [10.0])
 
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_the_generator_knows_what_a_camera_sees_of_each_vehicle() -> None:
+def test_the_generator_knows_what_a_camera_sees_of_each_vehicle():
     truth = SceneTruth("samples/street/vehicles.toml", threads=1)
     drive = Drive.given(
         "samples/street/vehicles.toml,samples/street/transforms_drive_vehicles.json"
@@ -223,7 +218,7 @@ def test_the_generator_knows_what_a_camera_sees_of_each_vehicle() -> None:
         assert ahead[2] > -6
 
 
-def test_what_is_no_drive_or_case_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_drive_or_case_is_refused(tmp_path):
     with pytest.raises(InvalidInput, match="'nothing' is not SCENE"):
         Drive.given("nothing")
     asked = EvalWorld(only=("weather",), work=tmp_path, out=tmp_path / "world.json")
@@ -233,7 +228,7 @@ def test_what_is_no_drive_or_case_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.sample
-def test_a_case_can_be_measured_by_itself_and_others_are_kept(tmp_path: Path) -> None:
+def test_a_case_can_be_measured_by_itself_and_others_are_kept(tmp_path):
     out = tmp_path / "world.json"
     run_world(EvalWorld(only=("cost",), work=tmp_path, out=out))
     result = json.loads(out.read_text())

@@ -44,7 +44,7 @@ async def echo(requests: AsyncIterator[bytes], context: Context) -> None:
         await context.write(request)
 
 
-async def test_messages_larger_than_every_window_come_back_whole() -> None:
+async def test_messages_larger_than_every_window_come_back_whole():
     messages = [bytes([i]) * size for i, size in enumerate((0, 1, 4096, 16_384, 300_000, 200_000))]
     call, received = await exchange(echo, messages, len(messages))
     assert received == messages
@@ -58,7 +58,7 @@ async def test_messages_larger_than_every_window_come_back_whole() -> None:
         (grpc.StatusCode.NOT_FOUND, ""),
     ],
 )
-async def test_the_servers_status_and_its_text_arrive(code: grpc.StatusCode, details: str) -> None:
+async def test_the_servers_status_and_its_text_arrive(code, details):
     async def refuse(requests: AsyncIterator[bytes], context: Context) -> None:
         async for request in requests:
             await context.write(request)
@@ -79,9 +79,7 @@ def server_of(call: GrpcCall) -> H2Connection:
 
 
 @given(st.lists(st.binary(max_size=50), max_size=5), st.lists(st.integers(1, 40), max_size=40))
-def test_it_does_not_matter_how_the_socket_cuts_the_bytes(
-    messages: list[bytes], cuts: list[int]
-) -> None:
+def test_it_does_not_matter_how_the_socket_cuts_the_bytes(messages, cuts):
     call, received = GrpcCall("a", METHOD), list[bytes]()
     server = server_of(call)
     for message in messages:
@@ -93,7 +91,7 @@ def test_it_does_not_matter_how_the_socket_cuts_the_bytes(
     assert received + call.receive(data) == messages
 
 
-def test_what_the_server_has_no_window_for_waits() -> None:
+def test_what_the_server_has_no_window_for_waits():
     call = GrpcCall("a", METHOD)
     server = server_of(call)
     call.send(bytes(70_000))
@@ -104,7 +102,7 @@ def test_what_the_server_has_no_window_for_waits() -> None:
     assert not call.is_blocked
 
 
-def test_a_compressed_message_is_refused() -> None:
+def test_a_compressed_message_is_refused():
     call = GrpcCall("a", METHOD)
     server = server_of(call)
     server.send_data(CALL, b"\1" + (1).to_bytes(4, "big") + b"x")
@@ -112,7 +110,7 @@ def test_a_compressed_message_is_refused() -> None:
         call.receive(server.data_to_send())
 
 
-def test_a_server_that_goes_away_or_resets_the_stream_ends_the_call() -> None:
+def test_a_server_that_goes_away_or_resets_the_stream_ends_the_call():
     away, reset = GrpcCall("a", METHOD), GrpcCall("a", METHOD)
     leaving, resetting = server_of(away), server_of(reset)
     leaving.close_connection(additional_data=b"maintenance")
@@ -125,7 +123,7 @@ def test_a_server_that_goes_away_or_resets_the_stream_ends_the_call() -> None:
         call.send(b"too late")
 
 
-def test_what_is_not_http2_is_refused() -> None:
+def test_what_is_not_http2_is_refused():
     data_of_a_stream_that_nobody_opened = bytes([0, 0, 1, 0, 0, 0, 0, 0, 3]) + b"x"
     with pytest.raises(ProtocolError, match="HTTP/2"):
         GrpcCall("a", METHOD).receive(data_of_a_stream_that_nobody_opened)

@@ -5,7 +5,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
@@ -28,7 +27,7 @@ from rfedge.results import read_result, rows_of
 
 
 @given(st.integers(1, 40), st.integers(0, 1200))
-def test_the_largest_number_is_found_within_a_tenth(first: int, true_limit: int) -> None:
+def test_the_largest_number_is_found_within_a_tenth(first, true_limit):
     asked: list[int] = []
 
     def held(vehicles: int) -> bool:
@@ -45,7 +44,7 @@ def test_the_largest_number_is_found_within_a_tenth(first: int, true_limit: int)
 # --- files
 
 
-def test_the_files_say_what_was_measured(tmp_path: Path) -> None:
+def test_the_files_say_what_was_measured(tmp_path):
     result = LoadResult([load_run(4, held=True), load_run(8, held=False)])
     write_load_result(result, tmp_path)
     content = read_result(tmp_path / "result.json", "loadtest")
@@ -60,7 +59,7 @@ def test_the_files_say_what_was_measured(tmp_path: Path) -> None:
     assert re.findall(r"(?:src|href)=.(?!data:|#)[^>]*", page) == [], "the page is self-contained"
 
 
-def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path: Path) -> None:
+def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path):
     run = load_run(8, held=False)
     verdict = replace(run.verdict, p50_ms=math.inf, p99_ms=math.inf)
     row = replace(run.row, p50_ms=None, p99_ms=None)
@@ -71,7 +70,7 @@ def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path: Path) -> None
     assert "<td>-</td><td>-</td>" in (tmp_path / "report.html").read_text()
 
 
-def test_text_of_a_run_cannot_break_the_page(tmp_path: Path) -> None:
+def test_text_of_a_run_cannot_break_the_page(tmp_path):
     run = load_run(8, held=False)
     row = replace(run.row, broken=["<script>x</script>"], limited_by="a & b")
     write_load_result(LoadResult([replace(run, row=row)]), tmp_path)
@@ -90,9 +89,7 @@ def test_text_of_a_run_cannot_break_the_page(tmp_path: Path) -> None:
         ([(4, False), (8, False)], "0 vehicles held (receiver, 640x360, 10 Hz)"),
     ],
 )
-def test_the_headline_names_the_largest_number_that_held(
-    runs: list[tuple[int, bool]], headline: str
-) -> None:
+def test_the_headline_names_the_largest_number_that_held(runs, headline):
     result = LoadResult([load_run(count, held=held) for count, held in runs])
     assert result.headline() == headline
 
@@ -100,10 +97,10 @@ def test_the_headline_names_the_largest_number_that_held(
 # --- tables
 
 
-def test_at_80_columns_each_run_is_on_a_line_with_its_number_and_verdict() -> None:
+def test_at_80_columns_each_run_is_on_a_line_with_its_number_and_verdict():
     console = Console(file=io.StringIO(), width=80)
     print_runs(console, LoadResult([load_run(4, held=True), load_run(8, held=False)]))
-    text = console.file.getvalue()  # type: ignore[attr-defined]
+    text = console.file.getvalue()
     assert "4 vehicles held (receiver, 640x360, 10 Hz)" in text
     assert re.search(r"│ +4 │ yes", text)
     assert re.search(r"│ +8 │ no", text)
@@ -113,7 +110,7 @@ def test_at_80_columns_each_run_is_on_a_line_with_its_number_and_verdict() -> No
 # --- charts
 
 
-def test_a_curve_of_latency_for_each_run_and_the_deadline() -> None:
+def test_a_curve_of_latency_for_each_run_and_the_deadline():
     """A run without an Ack has an empty curve and its name."""
     svg = latency_chart({"4 vehicles": [10.0, 20.0], "8 vehicles": []}, 100.0)
     texts = ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")

@@ -30,18 +30,18 @@ def run_of(*vehicles: VehicleReport, growth_mb: float = 0.0) -> Measured:
 @pytest.mark.parametrize(
     ("successes", "trials", "lower"), [(10, 10, 0.7225), (95, 100, 0.8882), (0, 10, 0.0)]
 )
-def test_wilsons_bound_is_the_published_one(successes: int, trials: int, lower: float) -> None:
+def test_wilsons_bound_is_the_published_one(successes, trials, lower):
     """Against tables of the score interval (Newcombe 1998)."""
     assert share_at_least(successes, trials) == pytest.approx(lower, abs=5e-5)
 
 
-def test_wilsons_bound_solves_its_equation() -> None:
+def test_wilsons_bound_solves_its_equation():
     """The bound is the share p from which the observed one is 1.96 standard errors away."""
     p = share_at_least(870, 1000)
     assert (0.87 - p) / math.sqrt(p * (1 - p) / 1000) == pytest.approx(1.959964, abs=1e-5)
 
 
-def test_a_good_run_is_held() -> None:
+def test_a_good_run_is_held():
     verdict = judge(run_of(vehicle(100), vehicle(99)), Bounds())
     assert verdict.held
     assert (verdict.p50_ms, verdict.on_time_percent) == (20.0, 99.5)
@@ -58,19 +58,19 @@ def test_a_good_run_is_held() -> None:
         (run_of(vehicle(0)), "p99 inf ms"),
     ],
 )
-def test_a_broken_bound_is_named(measured: Measured, said: str) -> None:
+def test_a_broken_bound_is_named(measured, said):
     verdict = judge(measured, Bounds())
     assert not verdict.held
     assert said in "; ".join(verdict.broken)
 
 
-def test_pictures_that_never_came_count_against_the_share() -> None:
+def test_pictures_that_never_came_count_against_the_share():
     verdict = judge(run_of(VehicleReport(100, [5.0] * 90)), Bounds())
     assert verdict.on_time_percent == 90.0
     assert verdict.p99_ms == 5.0, "of those acknowledged"
 
 
-def test_what_others_use_is_the_limit_only_where_a_bound_was_broken() -> None:
+def test_what_others_use_is_the_limit_only_where_a_bound_was_broken():
     crowded = replace(IDLE, machine=1.0, test=0.3, server_loop=0.6, others=1.4)
     held = replace(run_of(vehicle(100)), resources=crowded)
     broken = replace(run_of(vehicle(90)), resources=crowded)
@@ -98,7 +98,7 @@ def test_what_others_use_is_the_limit_only_where_a_bound_was_broken() -> None:
         ({"generator_lag_ms": 25.0, "machine": 0.99}, "CPU of the machine, at 99 %"),
     ],
 )
-def test_the_resource_at_its_limit_is_named(change: dict[str, float], named: str) -> None:
+def test_the_resource_at_its_limit_is_named(change, named):
     assert limit(replace(IDLE, **change)) == named
 
 
@@ -110,9 +110,7 @@ def test_the_resource_at_its_limit_is_named(change: dict[str, float], named: str
         ({"workers": 0.84, "machine": 0.9}, "nearest: server's workers, at 84 %"),
     ],
 )
-def test_without_one_at_its_limit_the_nearest_is_named(
-    change: dict[str, float], named: str
-) -> None:
+def test_without_one_at_its_limit_the_nearest_is_named(change, named):
     assert limit(replace(IDLE, **change)) == named
 
 
@@ -124,7 +122,5 @@ def test_without_one_at_its_limit_the_nearest_is_named(
         ({"machine": 1.0, "workers": 0.5}, "nearest: server's workers, at 50 %"),
     ],
 )
-def test_a_held_load_is_nearest_to_a_limit_by_its_own_use(
-    change: dict[str, float], named: str
-) -> None:
+def test_a_held_load_is_nearest_to_a_limit_by_its_own_use(change, named):
     assert nearest(replace(IDLE, **change)) == named

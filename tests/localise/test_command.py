@@ -57,7 +57,7 @@ def outcome(number: int, error_m: float | None, time_ns: int = 0) -> SearchOutco
     return SearchOutcome(picture(number, time_ns), POSE, found, error_m, 0.02, right, 300.0, 250.0)
 
 
-def test_a_start_is_exactly_as_far_off_as_asked_and_mostly_level() -> None:
+def test_a_start_is_exactly_as_far_off_as_asked_and_mostly_level():
     rng = np.random.default_rng(1)
     starts = [POSE.inverse().compose(displaced(POSE, ERROR, rng)) for _ in range(50)]
     for start in starts:
@@ -69,7 +69,7 @@ def test_a_start_is_exactly_as_far_off_as_asked_and_mostly_level() -> None:
     assert {yaw > 0 for yaw in yaws} == {True, False}
 
 
-def test_a_summary_counts_right_and_wrong_poses_of_all_tries() -> None:
+def test_a_summary_counts_right_and_wrong_poses_of_all_tries():
     done = [outcome(n, error_m) for n, error_m in enumerate((0.002, 0.004, 1.0, None))]
     row = SearchSummary.of("drive", ERROR, done)
     assert (row.tries, row.localised_percent, row.false_percent) == (4, 50.0, 25.0)
@@ -80,7 +80,7 @@ def test_a_summary_counts_right_and_wrong_poses_of_all_tries() -> None:
     assert "no pose" in str(SearchSummary.of("drive", ERROR, [outcome(0, None)]))
 
 
-def test_poses_are_written_once_a_picture_and_gaps_are_told(tmp_path: Path) -> None:
+def test_poses_are_written_once_a_picture_and_gaps_are_told(tmp_path):
     out = tmp_path / "poses.tum"
     done = [outcome(n, 0.001 if n != 1 else None, n * 100_000_000) for n in range(3)]
     assert write_poses(out, [*done, outcome(2, 0.001)]) == 2
@@ -90,26 +90,24 @@ def test_poses_are_written_once_a_picture_and_gaps_are_told(tmp_path: Path) -> N
     assert "# 0.100000000 lost: few inliers" in out.read_text()
 
 
-def test_poses_of_pictures_without_times_are_numbered(tmp_path: Path) -> None:
+def test_poses_of_pictures_without_times_are_numbered(tmp_path):
     out = tmp_path / "poses.tum"
     assert write_poses(out, [outcome(n, 0.001) for n in range(3)]) == 3
     assert out.read_text().startswith("# number of the picture tx ty tz qx qy qz qw\n0 1 2 3 ")
 
 
 @pytest.mark.parametrize("text", ["2m", "3deg:2m", "0m:1deg", "2m:0deg", "-1m:1deg", "nanm:1deg"])
-def test_a_start_error_of_another_form_is_refused(text: str) -> None:
+def test_a_start_error_of_another_form_is_refused(text):
     with pytest.raises(InvalidInput, match="is not METRESm:DEGREESdeg, such as 2m:3deg"):
         parse_start_error(text)
 
 
-def test_a_start_error_may_have_fractions() -> None:
+def test_a_start_error_may_have_fractions():
     assert parse_start_error("0.5m:1.25deg") == StartError(0.5, 1.25)
 
 
 @pytest.mark.sample
-def test_the_command_localises_the_samples_drive(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_localises_the_samples_drive(tmp_path, capsys):
     out, result = tmp_path / "poses.tum", tmp_path / "localise.json"
     drive = SAMPLES / "street/transforms_drive_empty.json"
     field = SAMPLES / "fields/street.rff"
@@ -122,7 +120,7 @@ def test_the_command_localises_the_samples_drive(
 
 
 @pytest.mark.sample
-def test_the_report_shows_errors_matches_and_what_was_lost(tmp_path: Path) -> None:
+def test_the_report_shows_errors_matches_and_what_was_lost(tmp_path):
     field = load_field(SAMPLES / "fields/street.rff")
     pictures = read_dataset(SAMPLES / "street/transforms_drive_empty.json").pictures
     dark = replace(pictures[1], read=lambda: np.zeros((360, 640, 3), np.uint8))
@@ -142,7 +140,7 @@ def test_the_report_shows_errors_matches_and_what_was_lost(tmp_path: Path) -> No
 
 
 @pytest.mark.sample
-def test_a_recorded_feed_says_where_to_search(tmp_path: Path) -> None:
+def test_a_recorded_feed_says_where_to_search(tmp_path):
     drive, feed = SAMPLES / "street/transforms_drive_empty.json", tmp_path / "feed.jsonl"
     MakeFeed(drive, str(feed), form="xyz", errors="gnss,rate_hz=5", seed=2).run()
     result = tmp_path / "result.json"
@@ -157,7 +155,7 @@ def test_a_recorded_feed_says_where_to_search(tmp_path: Path) -> None:
 
 
 @pytest.mark.sample
-def test_a_feed_of_another_time_is_refused(tmp_path: Path) -> None:
+def test_a_feed_of_another_time_is_refused(tmp_path):
     drive, feed = SAMPLES / "street/transforms_drive_empty.json", tmp_path / "feed.jsonl"
     MakeFeed(drive, str(feed), form="xyz", start_s=1.7e9).run()
     with pytest.raises(InvalidInput, match="see --feed-offset-s"):
@@ -168,7 +166,7 @@ def test_a_feed_of_another_time_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("late_s", [-0.25, 0.4])
-def test_poses_that_were_found_tell_how_late_a_feed_is(tmp_path: Path, late_s: float) -> None:
+def test_poses_that_were_found_tell_how_late_a_feed_is(tmp_path, late_s):
     poses = [Pose((8.0 * math.sin(0.15 * n), 0.6 * n, 0.0), POSE.rotation) for n in range(60)]
     times_s = [10.0 + 0.1 * n for n in range(60)]
     pictures = [

@@ -62,7 +62,7 @@ def search(
 @pytest.mark.parametrize(
     ("number", "drive"), [(0, "empty"), (9, "empty"), (20, "empty"), (12, "vehicles")]
 )
-def test_a_start_2_m_and_3_degrees_off_finds_the_pose(number: int, drive: str) -> None:
+def test_a_start_2_m_and_3_degrees_off_finds_the_pose(number, drive):
     """Within 0.3 % of the median depth, which is 10.7 m, and 0.1 degrees."""
     answer = search(number, drive=drive)
     assert isinstance(answer, Localised)
@@ -74,31 +74,31 @@ def test_a_start_2_m_and_3_degrees_off_finds_the_pose(number: int, drive: str) -
     assert answer.solution.inliers > 50
 
 
-def test_the_same_search_gives_the_same_bits() -> None:
+def test_the_same_search_gives_the_same_bits():
     assert search(5) == search(5)
 
 
-def test_a_black_picture_is_lost_before_anything_is_rendered() -> None:
+def test_a_black_picture_is_lost_before_anything_is_rendered():
     answer = search(3, np.zeros((360, 640, 3), np.uint8))
     assert answer == Lost(Obstacle.FEW_FEATURES, 0)
 
 
-def test_noise_is_lost() -> None:
+def test_noise_is_lost():
     noise = np.random.default_rng(2).integers(0, 256, (360, 640, 3), np.uint8)
     assert search(3, noise) == Lost(Obstacle.FEW_INLIERS, 3)
 
 
-def test_a_street_that_is_nowhere_is_lost() -> None:
+def test_a_street_that_is_nowhere_is_lost():
     """Mirrored: everything a street has, in no place of this one."""
     assert isinstance(search(3, np.ascontiguousarray(picture(3).read()[:, ::-1])), Lost)
 
 
-def test_a_search_that_looks_the_other_way_is_lost() -> None:
+def test_a_search_that_looks_the_other_way_is_lost():
     turned = moved(picture(3).camera.world_from_cam, (0.0, 0.0, 0.0), (0.0, math.pi, 0.0))
     assert isinstance(search(3, around=turned), Lost)
 
 
-def test_a_pose_too_far_from_a_sure_prior_is_not_claimed() -> None:
+def test_a_pose_too_far_from_a_sure_prior_is_not_claimed():
     """Features find the pose 2 m away; a prior of 0.1 m refutes it."""
     taken = picture(9)
     prior = PosePrior(moved(taken.camera.world_from_cam, *START), 0.1, 3.0)
@@ -106,18 +106,11 @@ def test_a_pose_too_far_from_a_sure_prior_is_not_claimed() -> None:
     assert answer == Lost(Obstacle.IMPLAUSIBLE, 3)
 
 
-def test_a_pose_that_looks_unlike_is_not_claimed() -> None:
+@pytest.mark.parametrize("least", [{"least_agreement": 1e6}, {"least_on_the_spot": 1.1}])
+def test_a_pose_that_looks_unlike_or_that_only_far_things_agree_with_is_not_claimed(least):
     taken = picture(9)
-    strict = LocaliserSettings(least_agreement=1e6, most_hypotheses=2)
     prior = PosePrior(taken.camera.world_from_cam, 2.0, 3.0)
-    answer = Localiser(field(), taken.camera.intrinsics, strict).localise(taken.read(), prior)
-    assert answer == Lost(Obstacle.UNLIKE, 2)
-
-
-def test_a_pose_that_only_far_things_agree_with_is_not_claimed() -> None:
-    taken = picture(9)
-    strict = LocaliserSettings(least_on_the_spot=1.1, most_hypotheses=2)
-    prior = PosePrior(taken.camera.world_from_cam, 2.0, 3.0)
+    strict = LocaliserSettings(most_hypotheses=2, **least)
     answer = Localiser(field(), taken.camera.intrinsics, strict).localise(taken.read(), prior)
     assert answer == Lost(Obstacle.UNLIKE, 2)
 
@@ -129,7 +122,7 @@ def on_the_spot(taken: PosedPicture, by_m: Vec3) -> float:
     return near_on_the_spot(picture, drawn, view)
 
 
-def test_near_things_tell_a_pose_from_one_decimetres_away_that_far_things_cannot() -> None:
+def test_near_things_tell_a_pose_from_one_decimetres_away_that_far_things_cannot():
     """Of poses ahead and behind, where the middle of the picture hardly moves."""
     limit = LocaliserSettings().least_on_the_spot
     for taken in (picture(9), picture(12, "vehicles")):
@@ -158,7 +151,7 @@ def carried(taken: PosedPicture, off_m: Vec3) -> Track | None:
 
 
 @pytest.mark.parametrize(("number", "drive"), [(9, "empty"), (21, "vehicles")])
-def test_a_track_that_begins_metres_off_is_right_or_does_not_begin(number: int, drive: str) -> None:
+def test_a_track_that_begins_metres_off_is_right_or_does_not_begin(number, drive):
     """By alignment and agreement alone, half of what begins here would be up to 2 m wrong."""
     taken = picture(number, drive)
     tracks = [carried(taken, off_m) for off_m in CARRIED_OFF_M]
@@ -181,14 +174,14 @@ class Emptiness:
         return View(np.zeros((*size, 3), np.float32), nothing, nothing)
 
 
-def test_nothing_is_found_in_an_empty_field() -> None:
+def test_nothing_is_found_in_an_empty_field():
     taken = picture(3)
     prior = PosePrior(taken.camera.world_from_cam, 1.0, 1.0)
     answer = Localiser(Emptiness(), taken.camera.intrinsics, FEW).localise(taken.read(), prior)
     assert answer == Lost(Obstacle.FEW_INLIERS, 3)
 
 
-def test_agreement_tells_the_place_from_one_beside_it_and_ignores_exposure() -> None:
+def test_agreement_tells_the_place_from_one_beside_it_and_ignores_exposure():
     taken = picture(9)
     pose, rgb = taken.camera.world_from_cam, taken.read()
     intrinsics = taken.camera.intrinsics
@@ -201,7 +194,7 @@ def test_agreement_tells_the_place_from_one_beside_it_and_ignores_exposure() -> 
     assert agreement(grey(rgb), beside) < limit
 
 
-def test_noise_agrees_with_nothing() -> None:
+def test_noise_agrees_with_nothing():
     """Gaussian chance of a thousand draws stays below five standard deviations."""
     view = field().render(picture(9).camera, FULL)
     rng = np.random.default_rng(4)
@@ -209,13 +202,13 @@ def test_noise_agrees_with_nothing() -> None:
     assert max(agreement(noise, view) for noise in noises) < 5.0
 
 
-def test_a_picture_of_another_size_is_refused() -> None:
+def test_a_picture_of_another_size_is_refused():
     localiser = Localiser(field(), Intrinsics(64, 36, 32, 32, 32, 18))
     prior = PosePrior(Pose.identity(), 1.0, 1.0)
     with pytest.raises(InvalidInput, match=r"uint8 \(360, 640, 3\) must be uint8 \(36, 64, 3\)"):
         localiser.localise(picture(3).read(), prior)
 
 
-def test_a_setting_of_zero_is_refused() -> None:
+def test_a_setting_of_zero_is_refused():
     with pytest.raises(InvalidInput, match=r"localiser.inlier_px: 0 must be above 0"):
         LocaliserSettings(inlier_px=0)

@@ -29,25 +29,23 @@ def exact_matches(count: int) -> Matches:
     return Matches(np.array(places) - 0.5, points)
 
 
-def test_exact_matches_give_the_exact_pose() -> None:
+def test_exact_matches_give_the_exact_pose():
     found = solve_pose(exact_matches(40), INTRINSICS, DRAWN_AT, 2.0)
-    assert found is not None
     assert found.inliers == 40
     assert found.world_from_cam.translation_m == pytest.approx(TRUTH.translation_m, abs=1e-4)
     assert found.rms_px < 1e-2
 
 
-def test_a_third_of_wrong_matches_does_not_move_the_pose() -> None:
+def test_a_third_of_wrong_matches_does_not_move_the_pose():
     exact = exact_matches(60)
     uv_px = exact.uv_px.copy()
     uv_px[::3] = np.random.default_rng(6).uniform(0, 120, (20, 2))
     found = solve_pose(Matches(uv_px, exact.xyz_m), INTRINSICS, DRAWN_AT, 2.0)
-    assert found is not None
     assert 38 <= found.inliers <= 42
     assert found.world_from_cam.translation_m == pytest.approx(TRUTH.translation_m, abs=0.02)
 
 
-def test_few_matches_and_matches_of_one_point_give_no_pose() -> None:
+def test_few_matches_and_matches_of_one_point_give_no_pose():
     few = exact_matches(5)
     assert solve_pose(few, INTRINSICS, DRAWN_AT, 2.0) is None
     same = Matches(np.repeat(few.uv_px[:1], 30, axis=0), np.repeat(few.xyz_m[:1], 30, axis=0))
@@ -61,7 +59,7 @@ def slanted_view() -> View:
     return View(np.zeros((120, 160, 3), np.float32), depth, np.ones((120, 160), np.float32))
 
 
-def test_a_place_between_pixels_of_a_plane_is_lifted_onto_the_plane() -> None:
+def test_a_place_between_pixels_of_a_plane_is_lifted_onto_the_plane():
     drawn_px = np.array([[20.25, 30.75], [159.0, 119.0], [0.0, 0.0]])
     points = lift_matches((drawn_px, drawn_px), slanted_view(), INTRINSICS, 0.5).xyz_m
     u, v = drawn_px.T
@@ -71,7 +69,7 @@ def test_a_place_between_pixels_of_a_plane_is_lifted_onto_the_plane() -> None:
     assert np.array(again) - 0.5 == pytest.approx(drawn_px, abs=1e-6)
 
 
-def test_places_without_a_trusted_depth_are_left_out() -> None:
+def test_places_without_a_trusted_depth_are_left_out():
     view = slanted_view()
     view.depth[10:20, 10:20] = 0.0
     view.opacity[40:50] = 0.1
@@ -80,7 +78,7 @@ def test_places_without_a_trusted_depth_are_left_out() -> None:
     assert kept.uv_px.tolist() == [[100.0, 100.0]]
 
 
-def test_a_match_needs_a_clear_lead_over_the_second_nearest() -> None:
+def test_a_match_needs_a_clear_lead_over_the_second_nearest():
     def at(*values: float) -> Features:
         descriptors = np.zeros((len(values), 128), np.float32)
         descriptors[:, 0] = values
@@ -92,7 +90,7 @@ def test_a_match_needs_a_clear_lead_over_the_second_nearest() -> None:
     assert len(match_features(at(1.0, 2.0), at(0.0), 0.8)[0]) == 0
 
 
-def test_a_flat_picture_has_no_features_and_a_cornered_one_has_them_at_its_corners() -> None:
+def test_a_flat_picture_has_no_features_and_a_cornered_one_has_them_at_its_corners():
     flat = np.full((120, 160), 90, np.uint8)
     assert find_features(flat, 100).uv_px.shape == (0, 2)
     assert find_features(flat, 100).descriptors.shape == (0, 128)

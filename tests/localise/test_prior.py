@@ -29,19 +29,19 @@ def distances_m(prior: PosePrior, depth_m: float) -> list[float]:
     return [math.hypot(*back.compose(pose).translation_m) for pose in hypotheses(prior, depth_m)]
 
 
-def test_the_prior_is_the_first_hypothesis() -> None:
+def test_the_prior_is_the_first_hypothesis():
     first = next(hypotheses(PosePrior(POSE, 2.0, 3.0), 10.0))
     assert first.translation_m == pytest.approx(POSE.translation_m)
     assert first.rotation == pytest.approx(POSE.rotation)
 
 
-def test_hypotheses_come_nearest_first_and_reach_the_standard_deviation() -> None:
+def test_hypotheses_come_nearest_first_and_reach_the_standard_deviation():
     far_m = distances_m(PosePrior(POSE, 4.0, 3.0), 10.0)
     assert all(near <= far + 1e-9 for near, far in pairwise(far_m))
     assert max(far_m) >= 4.0
 
 
-def test_a_vague_prior_has_more_hypotheses_and_never_more_than_the_rings_allow() -> None:
+def test_a_vague_prior_has_more_hypotheses_and_never_more_than_the_rings_allow():
     counts = [len(distances_m(PosePrior(POSE, s, s), 10.0)) for s in (0.1, 4.0, 20.0, 2e4)]
     assert counts == sorted(counts)
     assert len(set(counts[:3])) == 3
@@ -49,17 +49,17 @@ def test_a_vague_prior_has_more_hypotheses_and_never_more_than_the_rings_allow()
     assert counts[-1] == rings * (1 + 2 * MOST_TURNS)
 
 
-def test_the_search_does_not_depend_on_the_unit_of_length() -> None:
+def test_the_search_does_not_depend_on_the_unit_of_length():
     metres = distances_m(PosePrior(POSE, 4.0, 3.0), 10.0)
     millimetres = distances_m(PosePrior(POSE, 4000.0, 3.0), 10_000.0)
     assert millimetres == pytest.approx([1000 * far for far in metres], abs=1e-6)
 
 
-def test_a_field_that_shows_nothing_at_the_prior_is_searched_around_it() -> None:
+def test_a_field_that_shows_nothing_at_the_prior_is_searched_around_it():
     assert max(distances_m(PosePrior(POSE, 3.0, 3.0), 0.0)) == pytest.approx(3.0)
 
 
-def test_a_compass_of_many_degrees_adds_turns_to_both_sides() -> None:
+def test_a_compass_of_many_degrees_adds_turns_to_both_sides():
     prior = PosePrior(POSE, 1e-3, REACH_DEG)
     forward = Pose.identity().inverse()
     turns = []
@@ -71,7 +71,7 @@ def test_a_compass_of_many_degrees_adds_turns_to_both_sides() -> None:
 
 
 @pytest.mark.parametrize(("share", "allowed"), [(0.99, True), (1.01, False)])
-def test_a_pose_beyond_four_standard_deviations_is_implausible(share: float, allowed: bool) -> None:
+def test_a_pose_beyond_four_standard_deviations_is_implausible(share, allowed):
     prior = PosePrior(POSE, 0.5, 2.0)
     turn_rad = math.radians(share * PLAUSIBLE * 2.0)
     assert prior.allows(moved(POSE, (share * PLAUSIBLE * 0.5, 0.0, 0.0))) is allowed
@@ -79,7 +79,7 @@ def test_a_pose_beyond_four_standard_deviations_is_implausible(share: float, all
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
-def test_a_deviation_that_is_none_is_refused(bad: float) -> None:
+def test_a_deviation_that_is_none_is_refused(bad):
     with pytest.raises(InvalidInput, match=r"prior.position_m: .* must be finite and above 0"):
         PosePrior(POSE, bad, 1.0)
     with pytest.raises(InvalidInput, match=r"prior.rotation_deg: .* must be finite and above 0"):
@@ -95,7 +95,7 @@ GOOD: dict[str, Any] = {
 }
 
 
-def test_a_measurement_with_a_rotation_is_a_pose() -> None:
+def test_a_measurement_with_a_rotation_is_a_pose():
     assert PoseMeasurement(**GOOD).world_from_cam == Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
     assert PoseMeasurement(**{**GOOD, "rotation": None}).world_from_cam is None
 
@@ -115,6 +115,6 @@ def test_a_measurement_with_a_rotation_is_a_pose() -> None:
         ("rotation_std_deg", -1.0, "rotation_std_deg"),
     ],
 )
-def test_what_no_sensor_can_mean_is_refused(name: str, value: object, reported: str) -> None:
+def test_what_no_sensor_can_mean_is_refused(name, value, reported):
     with pytest.raises(InvalidInput, match=reported):
         PoseMeasurement(**{**GOOD, name: value})

@@ -40,15 +40,13 @@ def projected_px(motion: Pose, level: int) -> float:
 
 
 @given(METRES, METRES, METRES, RADIANS, RADIANS, RADIANS, st.integers(0, 2))
-def test_a_motion_moves_pixels_as_far_as_opencv_projects_them(
-    x: float, y: float, z: float, a: float, b: float, c: float, level: int
-) -> None:
+def test_a_motion_moves_pixels_as_far_as_opencv_projects_them(x, y, z, a, b, c, level):
     motion = Pose((x, y, z), quaternion_from_vector((a, b, c)))
     expected_px = pytest.approx(projected_px(motion, level), rel=1e-3, abs=1e-3)
     assert TEMPLATE.moved_px(motion, level) == expected_px
 
 
-def test_what_a_turn_undoes_far_away_still_moves_what_is_near() -> None:
+def test_what_a_turn_undoes_far_away_still_moves_what_is_near():
     down_m = 0.19
     turn = quaternion_from_vector((down_m / WALL_M, 0.0, 0.0))
     at_the_wall = Pose((0.0, down_m, 0.0), turn)
@@ -91,7 +89,7 @@ def followed_to(pose: Pose, number: int, track: Track, renderer: Renderer) -> Tr
 
 
 @pytest.mark.parametrize(("share", "scale"), [(1.0, 1.0), (0.95, 1 / 0.95)])
-def test_motions_are_scaled_by_what_the_depth_is_wrong(share: float, scale: float) -> None:
+def test_motions_are_scaled_by_what_the_depth_is_wrong(share, scale):
     """Depth of a share makes movements look like that share of what they are."""
     shallow = Shallow(share)
     track = begun_at(ahead(0.0), shallow)
@@ -100,7 +98,7 @@ def test_motions_are_scaled_by_what_the_depth_is_wrong(share: float, scale: floa
     assert track.motion_scale == pytest.approx(scale, abs=0.012)
 
 
-def test_tracking_from_half_the_resolution_on_leaves_the_finest_level_out() -> None:
+def test_tracking_from_half_the_resolution_on_leaves_the_finest_level_out():
     """The finest structure, which is most of the time, is never made; poses stay near."""
 
     def at(number: int) -> Pose:
@@ -119,9 +117,7 @@ def test_tracking_from_half_the_resolution_on_leaves_the_finest_level_out() -> N
 
 
 @pytest.mark.parametrize(("step_m", "share"), [(0.8, 0.7), (0.8, 1.25), (1.2, 0.8), (1.2, 1.25)])
-def test_a_picture_that_was_predicted_far_off_is_found_with_one_render_more(
-    step_m: float, share: float
-) -> None:
+def test_a_picture_that_was_predicted_far_off_is_found_with_one_render_more(step_m, share):
     """Wrong depth leads it 0.1 m and more aside, further than the finest level reaches."""
     track = begun_at(ahead(0.0), Planes())
     for number in (1, 2):

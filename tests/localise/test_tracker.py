@@ -86,13 +86,13 @@ def tracking(count: int = 3) -> PoseTracker:
     return tracker
 
 
-def test_without_a_measurement_it_is_lost_and_searches_nowhere() -> None:
+def test_without_a_measurement_it_is_lost_and_searches_nowhere():
     tracker = PoseTracker(Planes(), INTRINSICS)
     assert tracker.locate(FRAMES[0], time_of(0)).state is LocalisationState.LOST
     assert tracker.search() is None
 
 
-def test_a_drive_is_followed_to_millimetres_after_one_search() -> None:
+def test_a_drive_is_followed_to_millimetres_after_one_search():
     tracker = PoseTracker(Planes(), INTRINSICS)
     for number in range(10):
         tracker.measure(measured(number, Pose((0.3, 0.1, -0.2), NO_TURN)))
@@ -102,17 +102,16 @@ def test_a_drive_is_followed_to_millimetres_after_one_search() -> None:
     assert tracker.counts[TrackerEvent.SEARCHED] == 1
 
 
-def test_what_is_sent_is_rounded_and_is_where_the_view_was_rendered() -> None:
+def test_what_is_sent_is_rounded_and_is_where_the_view_was_rendered():
     tracker = tracking()
     fix = driven(tracker, 3)
-    assert fix.view is not None
     assert fix.world_from_cam == fix.view.camera.world_from_cam
     assert fix.view.camera == fix.view.camera.rounded()
     assert fix.covariance is not None
     assert (np.linalg.eigvalsh(fix.covariance) > 0).all()
 
 
-def test_a_constant_offset_is_learnt_and_taken_away_from_the_next_prior() -> None:
+def test_a_constant_offset_is_learnt_and_taken_away_from_the_next_prior():
     tracker = PoseTracker(Planes(), INTRINSICS)
     offset = Pose((0.7, 0.0, 0.2), NO_TURN)
     for number in range(9):
@@ -121,18 +120,17 @@ def test_a_constant_offset_is_learnt_and_taken_away_from_the_next_prior() -> Non
     bias = tracker.feed.bias.value
     assert bias[0] == pytest.approx(0.7, abs=0.15)
     prior = tracker.feed.prior(time_of(9), None, None, 1.0)
-    assert prior is not None
     assert abs(prior.world_from_cam.translation_m[0] - pose_of(8).translation_m[0]) < 0.15
 
 
-def test_a_silent_feed_is_bridged() -> None:
+def test_a_silent_feed_is_bridged():
     tracker = tracking(3)
     for number in range(3, 10):
         assert driven(tracker, number).state is LocalisationState.TRACKING
     assert tracker.counts[TrackerEvent.SEARCHED] == 1
 
 
-def test_a_black_picture_is_lost_and_the_next_good_one_is_found_again() -> None:
+def test_a_black_picture_is_lost_and_the_next_good_one_is_found_again():
     tracker = tracking(3)
     black = I420(np.full_like(FRAMES[0].y, 16), FRAMES[0].u, FRAMES[0].v)
     gone = driven(tracker, 3, black, lambda _: Lost(Obstacle.FEW_FEATURES, 0))
@@ -141,7 +139,7 @@ def test_a_black_picture_is_lost_and_the_next_good_one_is_found_again() -> None:
     assert driven(tracker, 4).state is LocalisationState.TRACKING
 
 
-def test_a_search_that_takes_three_pictures_is_carried_forward() -> None:
+def test_a_search_that_takes_three_pictures_is_carried_forward():
     tracker = PoseTracker(Planes(), INTRINSICS)
     states = []
     job = None
@@ -161,14 +159,14 @@ def test_a_search_that_takes_three_pictures_is_carried_forward() -> None:
     assert states[-1] is LocalisationState.TRACKING
 
 
-def test_a_teleport_is_found_again_with_the_second_picture() -> None:
+def test_a_teleport_is_found_again_with_the_second_picture():
     tracker = tracking(3)
     fix = driven(tracker, 9, time_ns=time_of(3))
     assert fix.state is LocalisationState.TRACKING
     assert error_m(fix, 9) < 0.02
 
 
-def test_a_measurement_of_a_drive_that_begins_again_is_not_backwards() -> None:
+def test_a_measurement_of_a_drive_that_begins_again_is_not_backwards():
     tracker = tracking(4)
     tracker.expect(time_of(0))
     tracker.measure(measured(0))
@@ -177,14 +175,14 @@ def test_a_measurement_of_a_drive_that_begins_again_is_not_backwards() -> None:
     assert tracker.counts[TrackerEvent.TIME_REVERSED] == 1
 
 
-def test_a_found_pose_that_the_picture_does_not_show_is_not_believed() -> None:
+def test_a_found_pose_that_the_picture_does_not_show_is_not_believed():
     tracker = PoseTracker(Planes(), INTRINSICS)
     tracker.measure(measured(0))
     wrong = found(moved(pose_of(0), (3.0, 0.0, 1.0)))
     assert driven(tracker, 0, answer=lambda _: wrong).state is not LocalisationState.TRACKING
 
 
-def test_an_answer_to_a_search_that_was_given_up_is_left_out() -> None:
+def test_an_answer_to_a_search_that_was_given_up_is_left_out():
     tracker = PoseTracker(Planes(), INTRINSICS)
     tracker.measure(measured(0))
     tracker.locate(FRAMES[0], time_of(0))
@@ -196,7 +194,7 @@ def test_an_answer_to_a_search_that_was_given_up_is_left_out() -> None:
     assert tracker.counts[TrackerEvent.TIME_REVERSED] == 1
 
 
-def test_searches_that_fail_come_less_and_less_often() -> None:
+def test_searches_that_fail_come_less_and_less_often():
     tracker = PoseTracker(Planes(), INTRINSICS)
     for number in range(100):
         tracker.measure(measured(0, time_ns=time_of(number)))
@@ -204,7 +202,7 @@ def test_searches_that_fail_come_less_and_less_often() -> None:
     assert 4 <= tracker.counts[TrackerEvent.SEARCHED] <= 10
 
 
-def test_a_measurement_of_another_time_is_stated_and_starts_no_search() -> None:
+def test_a_measurement_of_another_time_is_stated_and_starts_no_search():
     tracker = PoseTracker(Planes(), INTRINSICS)
     tracker.measure(measured(0, time_ns=time_of(0) + 3_600_000_000_000))
     assert tracker.locate(FRAMES[0], time_of(0)).state is LocalisationState.LOST
@@ -237,9 +235,7 @@ wall agrees and the ground before the camera is 5 px off."""
 @settings(max_examples=25, deadline=None)
 @example(events=LOOSELY_PREDICTED)
 @given(events=st.lists(st.tuples(SENSOR_EVENTS, PICTURES, ANSWERS), min_size=3, max_size=9))
-def test_no_feed_and_no_answer_makes_it_claim_what_the_picture_does_not_show(
-    events: list[tuple[str, str, str]],
-) -> None:
+def test_no_feed_and_no_answer_makes_it_claim_what_the_picture_does_not_show(events):
     tracker = PoseTracker(Planes(), INTRINSICS)
     place = 0
     for number, (sensor, kind, answer) in enumerate(events):

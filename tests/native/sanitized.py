@@ -14,8 +14,6 @@ def main() -> int:
     """Put the extension in its place, then run the tests."""
     (path,) = Path(sys.argv[1]).glob("_native*.so")
     spec = importlib.util.spec_from_file_location("rfcore.native._native", path)
-    assert spec is not None
-    assert spec.loader is not None
     extension = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = extension
     spec.loader.exec_module(extension)

@@ -1,7 +1,6 @@
 """The hash grid's kernels on another architecture: the same bytes, drawing and training."""
 
 import struct
-from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from math import prod
 
@@ -23,8 +22,6 @@ from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
 
 pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.timeout(900)]
 
-Emulated = Callable[[str, str, int, bytes], bytes]
-FirstDifference = Callable[[bytes, bytes], int | None]
 
 STEPS, RATES, THRESHOLD = 3, NgpRates(), 0.01
 CAMERA = Camera(
@@ -107,13 +104,8 @@ def trained(made: Scene) -> bytes:
 @pytest.mark.parametrize(("isa", "threads"), [("neon", 1), ("neon", 3), ("scalar", 2)])
 @pytest.mark.parametrize(("unbounded", "samples_per_ray"), [(False, 0), (True, 6)])
 def test_aarch64_draws_and_trains_a_hash_grid_to_the_same_bytes(
-    emulated: Emulated,
-    first_difference: FirstDifference,
-    isa: str,
-    threads: int,
-    unbounded: bool,
-    samples_per_ray: int,
-) -> None:
+    emulated, first_difference, isa, threads, unbounded, samples_per_ray
+):
     made = scene(unbounded, samples_per_ray)
     there = emulated("exactness_ngp", isa, threads, made.to_bytes())
     assert first_difference(there, drawn(made) + trained(made)) is None

@@ -1,7 +1,6 @@
 """The slice coder's kernels on another architecture: the same bytes, NEON and scalar."""
 
 import struct
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ from rfcore.native.backend import available_isas
 
 pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.timeout(900)]
 
-Emulated = Callable[[str, str, int, bytes], bytes]
-FirstDifference = Callable[[bytes, bytes], int | None]
 
 SIZE = WIDTH, HEIGHT = 83, 45
 MACROBLOCKS = 6 * 3
@@ -42,13 +39,8 @@ def pictures(count: int) -> list[I420]:
 @pytest.mark.parametrize(("references", "qp"), [(3, 20), (1, 36), (0, 28)])
 @pytest.mark.parametrize("effort", Effort)
 def test_aarch64_codes_a_picture_to_the_same_bytes(
-    emulated: Emulated,
-    first_difference: FirstDifference,
-    effort: Effort,
-    references: int,
-    qp: int,
-    isa: str,
-) -> None:
+    emulated, first_difference, effort, references, qp, isa
+):
     frame, *others = pictures(1 + references)
     quantisers = (qp + np.arange(MACROBLOCKS) % 3).astype(np.int8)
     reconstruction = I420(*(np.empty_like(plane) for plane in frame.planes))

@@ -5,7 +5,6 @@ depth, opacity, YUV and RGB planes, losses, parameters after three steps.
 """
 
 import struct
-from collections.abc import Callable
 from dataclasses import astuple, dataclass
 
 import numpy as np
@@ -19,8 +18,6 @@ from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 
 pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.timeout(900)]
 
-Emulated = Callable[[str, str, int, bytes], bytes]
-FirstDifference = Callable[[bytes, bytes], int | None]
 ARRAYS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 STEPS = 3
 RATES = LearningRates(means=1e-2)
@@ -93,13 +90,8 @@ SCENES = {"street": street, "poison": poison}
 )
 @pytest.mark.parametrize("name", SCENES)
 def test_aarch64_draws_and_trains_the_same_bytes(
-    emulated: Emulated,
-    first_difference: FirstDifference,
-    name: str,
-    isa: str,
-    threads: int,
-    antialiased: bool,
-) -> None:
+    emulated, first_difference, name, isa, threads, antialiased
+):
     scene = SCENES[name](antialiased)
     there = emulated("exactness_splats", isa, threads, scene.to_bytes())
     assert first_difference(there, drawn(scene) + trained(scene)) is None

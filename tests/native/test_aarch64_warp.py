@@ -1,7 +1,6 @@
 """Warp, correction, relit render and block costs on another architecture: the same bytes."""
 
 import struct
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -20,8 +19,6 @@ from rfcore.views import FieldView
 
 pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.timeout(900)]
 
-Emulated = Callable[[str, str, int, bytes], bytes]
-FirstDifference = Callable[[bytes, bytes], int | None]
 
 INTRINSICS = Intrinsics(83, 45, 60.0, 61.0, 41.0, 23.0)
 BEFORE = Camera(INTRINSICS, Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
@@ -46,9 +43,7 @@ def as_bytes(*pictures: I420) -> bytes:
     return b"".join(plane.tobytes() for made in pictures for plane in made.planes)
 
 
-def test_aarch64_carries_a_picture_to_the_same_bytes(
-    emulated: Emulated, first_difference: FirstDifference
-) -> None:
+def test_aarch64_carries_a_picture_to_the_same_bytes(emulated, first_difference):
     previous, render, previous_render = (picture(seed) for seed in (1, 2, 3))
     before = FieldView(BEFORE, previous_render, depth(4))
     now = FieldView(NOW, render, depth(5))

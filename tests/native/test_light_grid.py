@@ -173,18 +173,14 @@ LEVELS = st.tuples(st.integers(0, 254), st.integers(1, 256)).map(
     seen=LEVELS,
     shown=LEVELS,
 )
-def test_the_kernel_equals_the_definition(
-    size_px: tuple[int, int], seed: int, seen: tuple[int, int], shown: tuple[int, int]
-) -> None:
+def test_the_kernel_equals_the_definition(size_px, seed, seen, shown):
     pictures = (picture(size_px, seed + n, *levels) for n, levels in enumerate((seen, shown)))
     require_definition(*pictures, picture(size_px, seed + 2))
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (15, 16), (17, 33), (300, 290)])
 @pytest.mark.parametrize("levels", [((255, 256), (0, 1)), ((0, 1), (255, 256))])
-def test_the_kernel_equals_the_definition_at_the_ends_of_the_range(
-    size_px: tuple[int, int], levels: tuple[tuple[int, int], tuple[int, int]]
-) -> None:
+def test_the_kernel_equals_the_definition_at_the_ends_of_the_range(size_px, levels):
     seen, shown = (picture(size_px, 1, *ends) for ends in levels)
     require_definition(seen, shown, picture(size_px, 2))
 
@@ -196,9 +192,7 @@ def test_the_kernel_equals_the_definition_at_the_ends_of_the_range(
     seen=LEVELS,
     shown=LEVELS,
 )
-def test_a_light_that_is_sent_equals_its_definition(
-    size_px: tuple[int, int], seed: int, seen: tuple[int, int], shown: tuple[int, int]
-) -> None:
+def test_a_light_that_is_sent_equals_its_definition(size_px, seed, seen, shown):
     frame, render = (picture(size_px, seed + n, *levels) for n, levels in enumerate((seen, shown)))
     changes = solve_light(frame, render)
     assert changes.shape == light_shape(size_px)
@@ -210,7 +204,7 @@ def test_a_light_that_is_sent_equals_its_definition(
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_changes_that_are_no_light_are_refused() -> None:
+def test_changes_that_are_no_light_are_refused():
     render = picture((65, 64), 1)
     changes = np.zeros((1, 2, 8, 3), np.int32)
     apply_light(render, changes)
@@ -222,14 +216,14 @@ def test_changes_that_are_no_light_are_refused() -> None:
         solve_light(picture((64, 64), 1), render)
 
 
-def test_the_right_light_changes_nothing() -> None:
+def test_the_right_light_changes_nothing():
     shown, now = picture((64, 48), 1, 1), picture((64, 48), 2, 1)
     found = relight_i420(shown, shown, now)
     for ours, theirs in zip(found.planes, now.planes, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_another_exposure_is_recovered_within_a_level() -> None:
+def test_another_exposure_is_recovered_within_a_level():
     shown, now = picture((160, 128), 1, 20, 220), picture((160, 128), 2, 20, 220)
     dark_shown, dark_now = (
         I420((p.y * 0.6 + 8).astype(np.uint8), p.u + np.uint8(9), p.v - np.uint8(5))
@@ -241,7 +235,7 @@ def test_another_exposure_is_recovered_within_a_level() -> None:
         assert np.abs(ours.astype(int) - theirs).mean() < 1.0
 
 
-def test_pictures_of_another_size_are_refused() -> None:
+def test_pictures_of_another_size_are_refused():
     small, large = picture((16, 16), 1), picture((18, 16), 1)
     with pytest.raises(InvalidInput, match=r"relight\.seen:.*\(18, 16\)"):
         relight_i420(large, small, small)

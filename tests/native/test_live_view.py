@@ -79,9 +79,7 @@ def defined_difference(
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (2, 9), (33, 17), (64, 48)])
 @pytest.mark.parametrize("light", [OWN_LIGHT, Light((0.5, 1.3, 2.0), (3.0, -8.5, 0.1))])
 @pytest.mark.parametrize("brightness", [1.0, 0.62])
-def test_a_change_is_what_is_defined(
-    width: int, height: int, light: Light, brightness: float
-) -> None:
+def test_a_change_is_what_is_defined(width, height, light, brightness):
     rng = np.random.default_rng(width)
     view = random_view(rng, width, height)
     near = level(view.colour * F(255)) + rng.normal(scale=25, size=view.colour.shape)
@@ -167,7 +165,7 @@ def defined_view(
     width=st.integers(1, 24),
     height=st.integers(1, 18),
 )
-def test_a_view_is_what_is_defined(seed: int, count: int, width: int, height: int) -> None:
+def test_a_view_is_what_is_defined(seed, count, width, height):
     rng = np.random.default_rng(seed)
     view, at = random_view(rng, width, height), camera(width, height)
     sources = []
@@ -190,7 +188,7 @@ def test_a_view_is_what_is_defined(seed: int, count: int, width: int, height: in
     assert rgb.tobytes() == expected.tobytes()
 
 
-def test_a_source_at_the_view_itself_is_taken_where_the_field_has_a_surface() -> None:
+def test_a_source_at_the_view_itself_is_taken_where_the_field_has_a_surface():
     rng = np.random.default_rng(4)
     view, at = random_view(rng, 40, 30), camera(40, 30)
     difference = np.full(view.colour.shape, 9.0, F)
@@ -204,7 +202,7 @@ def test_a_source_at_the_view_itself_is_taken_where_the_field_has_a_surface() ->
     assert np.array_equal(rgb[covered], np.minimum(own[covered] + 9, 255).astype(np.uint8))
 
 
-def test_pictures_that_do_not_fit_are_refused() -> None:
+def test_pictures_that_do_not_fit_are_refused():
     view = random_view(np.random.default_rng(1), 8, 6)
     with pytest.raises(InvalidInput, match="beside a view"):
         live_difference(np.zeros((6, 9, 3), np.uint8), view, OWN_LIGHT)

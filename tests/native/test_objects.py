@@ -14,14 +14,14 @@ MERGEABLE = set("vVwWu")
 """Types of `nm` for weak and unique symbols."""
 
 
-def test_the_build_keeps_an_object_per_instruction_set() -> None:
+def test_the_build_keeps_an_object_per_instruction_set():
     names = {part for path in OBJECTS for part in path.parts if part.startswith("kernels_")}
     assert "kernels_scalar.dir" in names, f"no kernel objects under {BUILD}; run `make build`"
     assert len(names) >= 2
 
 
 @pytest.mark.parametrize("path", OBJECTS, ids=lambda path: path.parents[-1].name + path.name)
-def test_no_symbol_of_a_kernel_object_is_weak_or_unique(path: Path) -> None:
+def test_no_symbol_of_a_kernel_object_is_weak_or_unique(path):
     nm = shutil.which("nm")
     assert nm is not None, "nm comes with the compiler that built the kernels"
     listing = subprocess.run([nm, path], capture_output=True, text=True, check=True).stdout
@@ -30,7 +30,7 @@ def test_no_symbol_of_a_kernel_object_is_weak_or_unique(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", OBJECTS, ids=lambda path: path.parents[-1].name + path.name)
-def test_a_kernel_object_exports_its_table_alone(path: Path) -> None:
+def test_a_kernel_object_exports_its_table_alone(path):
     listing = subprocess.run(
         ["nm", "--extern-only", "--defined-only", path], capture_output=True, text=True, check=True
     ).stdout

@@ -62,11 +62,11 @@ def native_functions() -> Functions:
     return found
 
 
-def test_the_stub_has_exactly_the_functions_and_parameters_of_the_module() -> None:
+def test_the_stub_has_exactly_the_functions_and_parameters_of_the_module():
     assert stub_functions() == native_functions()
 
 
-def test_signatures_with_nested_brackets_are_read() -> None:
+def test_signatures_with_nested_brackets_are_read():
     class Function:
         __nb_signature__ = (
             ("def f(self, a: list[tuple[int, int]], b: x(shape=(*, 3)) = 3)", None),

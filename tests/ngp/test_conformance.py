@@ -16,9 +16,8 @@ from rfcore.ngp import reference
 from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.shape import NgpParameters
 from rfcore.views import View
+from tests.ngp.conftest import camera, numbers
 
-NumbersMaker = Callable[..., NgpParameters]
-CameraMaker = Callable[..., Camera]
 Draw = Callable[[NgpParameters, Camera], View]
 
 TOLERANCE = 1e-4
@@ -45,9 +44,7 @@ def draw(request: pytest.FixtureRequest) -> Draw:
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
-def test_it_draws_the_definition(
-    draw: Draw, numbers: NumbersMaker, camera: CameraMaker, unbounded: bool
-) -> None:
+def test_it_draws_the_definition(draw, unbounded):
     field = numbers(unbounded=unbounded, occupied_share=0.7)
     got = draw(field, camera())
     want = by_definition(torch.float64)(field, camera())
@@ -56,9 +53,7 @@ def test_it_draws_the_definition(
     assert np.abs(got.colour - want.colour)[~flipped].max() < 2 * TOLERANCE
 
 
-def test_the_definition_never_leaves_the_device_of_its_parameters(
-    numbers: NumbersMaker, camera: CameraMaker
-) -> None:
+def test_the_definition_never_leaves_the_device_of_its_parameters():
     """The meta device computes shapes alone and refuses tensors of another device, like CUDA."""
     field = numbers()
     params = reference.parameters(field, torch.float32, device="meta")

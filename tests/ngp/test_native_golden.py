@@ -78,12 +78,12 @@ def trained_digest(isa: str | None = None) -> str:
 
 
 @pytest.mark.parametrize("isa", available_isas())
-def test_a_rendered_grid_has_the_committed_bytes(isa: str) -> None:
+def test_a_rendered_grid_has_the_committed_bytes(isa):
     assert view_digest(isa) == VIEW_DIGEST
 
 
 @pytest.mark.parametrize("isa", available_isas())
-def test_a_trained_grid_has_the_committed_bytes(isa: str) -> None:
+def test_a_trained_grid_has_the_committed_bytes(isa):
     assert trained_digest(isa) == TRAINED_DIGEST
 
 

@@ -1,6 +1,5 @@
 """Training on the native kernels: gradients of the definition, deterministic steps."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +10,7 @@ from rfcore.errors import InvalidInput
 from rfcore.ngp import reference
 from rfcore.ngp.shape import NgpParameters
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
-
-NumbersMaker = Callable[..., NgpParameters]
+from tests.ngp.conftest import numbers
 
 GRADIENT_TOLERANCE = 1e-4
 
@@ -55,8 +53,8 @@ def state_bytes(trainable: TrainableNgp) -> bytes:
 @pytest.mark.parametrize(("levels", "hidden"), [(1, 16), (5, 32), (9, 48), (16, 64)])
 @pytest.mark.parametrize("samples_per_ray", [200, 11])
 def test_loss_and_gradients_follow_the_float64_definition(
-    numbers: NumbersMaker, unbounded: bool, levels: int, hidden: int, samples_per_ray: int
-) -> None:
+    unbounded, levels, hidden, samples_per_ray
+):
     field = numbers(unbounded=unbounded, levels=levels, hidden=hidden)
     batch = replace(rays(), samples_per_ray=samples_per_ray)
     params = reference.parameters(field, requires_grad=True)
@@ -70,7 +68,7 @@ def test_loss_and_gradients_follow_the_float64_definition(
     assert relative_error(matrices, wanted) < GRADIENT_TOLERANCE
 
 
-def test_gradients_are_the_finite_differences_of_the_definition(numbers: NumbersMaker) -> None:
+def test_gradients_are_the_finite_differences_of_the_definition():
     field, batch = numbers(levels=3), rays(12)
     trainable = TrainableNgp(field, peaks(field))
     trainable.accumulate(batch)
@@ -100,15 +98,13 @@ def trained(field: NgpParameters, isa: str | None, threads: int, steps: int = 4)
     return trainable
 
 
-def test_every_instruction_set_and_thread_count_trains_the_same_bytes(
-    numbers: NumbersMaker, isa: str, threads: int
-) -> None:
+def test_every_instruction_set_and_thread_count_trains_the_same_bytes(isa, threads):
     field = numbers(hidden=32)
     definition = trained(field, "scalar", 1)
     assert state_bytes(trained(field, isa, threads)) == state_bytes(definition)
 
 
-def test_steps_lower_the_loss_of_a_batch(numbers: NumbersMaker) -> None:
+def test_steps_lower_the_loss_of_a_batch():
     field, batch = numbers(table_range=1e-4), rays(200)
     trainable = TrainableNgp(field, peaks(field))
     losses = []
@@ -118,7 +114,7 @@ def test_steps_lower_the_loss_of_a_batch(numbers: NumbersMaker) -> None:
     assert losses[-1] < 0.4 * losses[0]
 
 
-def test_a_restored_state_goes_on_as_if_nothing_had_happened(numbers: NumbersMaker) -> None:
+def test_a_restored_state_goes_on_as_if_nothing_had_happened():
     field = numbers()
     through = trained(field, None, 1, steps=3)
     resumed = TrainableNgp(numbers(seed=9), peaks(field))
@@ -129,7 +125,7 @@ def test_a_restored_state_goes_on_as_if_nothing_had_happened(numbers: NumbersMak
     assert state_bytes(resumed) == state_bytes(through)
 
 
-def test_entries_no_sample_touches_stay_with_their_moments(numbers: NumbersMaker) -> None:
+def test_entries_no_sample_touches_stay_with_their_moments():
     field = numbers(log2_T=14)
     trainable = TrainableNgp(field, peaks(field))
     batch = rays(8)
@@ -144,7 +140,7 @@ def test_entries_no_sample_touches_stay_with_their_moments(numbers: NumbersMaker
     assert not after["table_m"][untouched].any()
 
 
-def test_cells_seen_empty_are_emptied_and_others_kept(numbers: NumbersMaker) -> None:
+def test_cells_seen_empty_are_emptied_and_others_kept():
     field = numbers(unbounded=False)
     matrices = field.matrices.copy()
     matrices[:] = 0
@@ -159,7 +155,7 @@ def test_cells_seen_empty_are_emptied_and_others_kept(numbers: NumbersMaker) -> 
 
 
 @pytest.mark.parametrize("name", ["origins", "directions", "jitter", "targets"])
-def test_rays_that_are_not_finite_are_refused_by_name(name: str) -> None:
+def test_rays_that_are_not_finite_are_refused_by_name(name):
     batch = rays()
     poisoned = getattr(batch, name).copy()
     poisoned.flat[3] = np.nan
@@ -168,6 +164,6 @@ def test_rays_that_are_not_finite_are_refused_by_name(name: str) -> None:
 
 
 @pytest.mark.parametrize(("rays_per_block", "samples_per_ray"), [(0, 1), (257, 1), (256, 65)])
-def test_a_block_beyond_its_memory_is_refused(rays_per_block: int, samples_per_ray: int) -> None:
+def test_a_block_beyond_its_memory_is_refused(rays_per_block, samples_per_ray):
     with pytest.raises(InvalidInput, match=r"rays\."):
         replace(rays(), rays_per_block=rays_per_block, samples_per_ray=samples_per_ray)

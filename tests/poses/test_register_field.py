@@ -38,7 +38,7 @@ def drive():
 
 
 @pytest.mark.sample
-def test_pictures_are_placed_in_a_field_told_by_its_content(images, tmp_path, capsys) -> None:
+def test_pictures_are_placed_in_a_field_told_by_its_content(images, tmp_path, capsys):
     field, out = tmp_path / "no-suffix", tmp_path / "out"
     field.write_bytes(FIELD.read_bytes())
     assert is_field_file(field)
@@ -54,13 +54,13 @@ def test_pictures_are_placed_in_a_field_told_by_its_content(images, tmp_path, ca
 
 
 @pytest.mark.sample
-def test_a_field_does_not_know_the_camera(images, tmp_path) -> None:
+def test_a_field_does_not_know_the_camera(images, tmp_path):
     with pytest.raises(InvalidInput, match="--camera-model PINHOLE"):
         DatasetPoses(images, tmp_path / "out", register_to=FIELD).run()
     assert not (tmp_path / "out").exists()
 
 
-def test_what_is_neither_field_nor_dataset_is_refused(tmp_path) -> None:
+def test_what_is_neither_field_nor_dataset_is_refused(tmp_path):
     damaged = tmp_path / "damaged.rff"
     damaged.write_bytes(FIELD.read_bytes()[:100])
     settings = {"camera_model": "PINHOLE", "parameters": PINHOLE}
@@ -76,7 +76,7 @@ def test_what_is_neither_field_nor_dataset_is_refused(tmp_path) -> None:
 
 
 @pytest.mark.sample
-def test_what_is_found_nowhere_asks_which_axis_is_up(tmp_path, monkeypatch) -> None:
+def test_what_is_found_nowhere_asks_which_axis_is_up(tmp_path, monkeypatch):
     monkeypatch.setattr(register, "GRID_STEPS", (0.0,))
     noise = np.random.default_rng(1).integers(0, 256, (360, 640, 3), np.uint8)
     (tmp_path / "images").mkdir()
@@ -91,7 +91,7 @@ def test_what_is_found_nowhere_asks_which_axis_is_up(tmp_path, monkeypatch) -> N
 
 
 @pytest.mark.sample
-def test_sigterm_ends_a_search_and_leaves_nothing(tmp_path) -> None:
+def test_sigterm_ends_a_search_and_leaves_nothing(tmp_path):
     images = tmp_path / "images"
     images.mkdir()
     noise = np.random.default_rng(1).integers(0, 256, (360, 640, 3), np.uint8)
@@ -102,7 +102,6 @@ def test_sigterm_ends_a_search_and_leaves_nothing(tmp_path) -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "rfedge", *command], stderr=subprocess.PIPE, text=True
     ) as process:
-        assert process.stderr is not None
         assert any("searching the whole field" in line for line in process.stderr)
         process.send_signal(signal.SIGTERM)
         said = process.stderr.read()

@@ -43,14 +43,14 @@ def quiet(_: str) -> None:
     pass
 
 
-def test_the_sharpest_frame_of_each_half_second_is_kept(video: Path, tmp_path: Path) -> None:
+def test_the_sharpest_frame_of_each_half_second_is_kept(video, tmp_path):
     told: list[str] = []
     assert sharpest_frames(video, tmp_path / "frames", 2.0, told.append) == 4
     assert kept(tmp_path / "frames") == list(SHARP)
     assert len(told) == 4
 
 
-def test_a_stopped_run_goes_on_and_decodes_nothing_twice(video: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_goes_on_and_decodes_nothing_twice(video, tmp_path):
     class Stopped(Exception):
         pass
 
@@ -67,21 +67,19 @@ def test_a_stopped_run_goes_on_and_decodes_nothing_twice(video: Path, tmp_path: 
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-def test_frames_of_another_rate_are_not_mixed(video: Path, tmp_path: Path) -> None:
+def test_frames_of_another_rate_are_not_mixed(video, tmp_path):
     sharpest_frames(video, tmp_path / "frames", 2.0, quiet)
     with pytest.raises(InvalidInput, match="another video or rate"):
         sharpest_frames(video, tmp_path / "frames", 1.0, quiet)
 
 
-def test_what_is_no_video_is_named(tmp_path: Path) -> None:
+def test_what_is_no_video_is_named(tmp_path):
     (tmp_path / "phone.mp4").write_text("not a video")
     with pytest.raises(DatasetError, match=r"phone\.mp4: not a readable video"):
         sharpest_frames(tmp_path / "phone.mp4", tmp_path / "frames", 2.0, quiet)
 
 
-def test_a_video_of_times_that_do_not_begin_at_zero_is_counted_from_its_start(
-    tmp_path: Path,
-) -> None:
+def test_a_video_of_times_that_do_not_begin_at_zero_is_counted_from_its_start(tmp_path):
     path = tmp_path / "cut.mkv"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=6, options={"crf": "10"})
@@ -96,7 +94,7 @@ def test_a_video_of_times_that_do_not_begin_at_zero_is_counted_from_its_start(
     assert kept(tmp_path / "frames") == list(SHARP)
 
 
-def test_blur_lowers_sharpness() -> None:
+def test_blur_lowers_sharpness():
     rng = np.random.default_rng(1)
     noise = rng.integers(0, 255, (40, 40), np.uint8)
     blurred = ((noise[:-1, :-1].astype(int) + noise[1:, 1:]) // 2).astype(np.uint8)
@@ -106,7 +104,7 @@ def test_blur_lowers_sharpness() -> None:
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_a_video_alone_becomes_a_dataset_with_poses(tmp_path: Path) -> None:
+def test_a_video_alone_becomes_a_dataset_with_poses(tmp_path):
     drive = read_dataset(sample_path("street/transforms_drive_empty.json"))
     write_mp4(tmp_path / "drive.mp4", (p.read() for p in drive.pictures[:8]), 10.0)
     k = drive.pictures[0].camera.intrinsics

@@ -1,6 +1,6 @@
 """Scenes with known properties, and every way to run the native rasterizer."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -13,11 +13,8 @@ from rfcore.raster.opencl import self_check
 from rfcore.raster.opencl.device import BUILDS, Build, Device, build_device, find_device
 from rfcore.raster.opencl.self_check import check_device
 
-SceneMaker = Callable[..., Gaussians]
-CameraMaker = Callable[..., Camera]
 
-
-def make_scene(count: int = 300, degree: int = 3, seed: int = 0) -> Gaussians:
+def scene(count: int = 300, degree: int = 3, seed: int = 0) -> Gaussians:
     """Return translucent blobs of 0.03 to 0.3 m in a box of 4 x 3 x 6 m in front of the camera."""
     rng = np.random.default_rng(seed)
     coefficients = (degree + 1) ** 2
@@ -33,7 +30,7 @@ def make_scene(count: int = 300, degree: int = 3, seed: int = 0) -> Gaussians:
     return Gaussians(*(np.ascontiguousarray(a, dtype=np.float32) for a in arrays))
 
 
-def make_camera(width_px: int = 67, height_px: int = 45) -> Camera:
+def camera(width_px: int = 67, height_px: int = 45) -> Camera:
     """Return a camera that looks slightly down and to the left, off-centre principal point."""
     focal = 0.8 * width_px
     intrinsics = Intrinsics(
@@ -43,16 +40,6 @@ def make_camera(width_px: int = 67, height_px: int = 45) -> Camera:
     norm = sum(v * v for v in rotation) ** 0.5
     w, x, y, z = (v / norm for v in rotation)
     return Camera(intrinsics, Pose((0.1, -0.05, -0.2), (w, x, y, z)))
-
-
-@pytest.fixture
-def scene() -> SceneMaker:
-    return make_scene
-
-
-@pytest.fixture
-def camera() -> CameraMaker:
-    return make_camera
 
 
 UNGUARDED = Build("unguarded", ("-DWORST_CASE", "-cl-mad-enable", "-cl-denorms-are-zero"))

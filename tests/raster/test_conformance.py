@@ -20,10 +20,8 @@ from rfcore.raster.gaussians import SKY_M, Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import TrainableRasterizer
 from rfcore.views import View
+from tests.raster.conftest import camera, scene
 
-SceneMaker = Callable[..., Gaussians]
-CameraMaker = Callable[..., Camera]
-Params = dict[str, Tensor]
 F32 = np.float32
 
 PICTURE_TOLERANCE, GRADIENT_TOLERANCE = 2e-5, 2e-4
@@ -94,7 +92,7 @@ def _named(name: str) -> Implementation:
 
 
 @pytest.fixture(params=["near", "with-sky"])
-def gaussians(request: pytest.FixtureRequest, scene: SceneMaker) -> Gaussians:
+def gaussians(request: pytest.FixtureRequest) -> Gaussians:
     """Opacities below 0.95: no alpha comes near a ceiling. With sky a third is 20,000 times as far
     away, and as wide."""
     made = scene(150, 2)
@@ -112,9 +110,7 @@ def gaussians(request: pytest.FixtureRequest, scene: SceneMaker) -> Gaussians:
 DEFINITION = torch_based(reference.render, torch.float64)
 
 
-def test_it_draws_the_definition(
-    implementation: Implementation, gaussians: Gaussians, camera: CameraMaker, antialiased: bool
-) -> None:
+def test_it_draws_the_definition(implementation, gaussians, antialiased):
     got = implementation.draw(gaussians, camera(), antialiased)
     want = DEFINITION.draw(gaussians, camera(), antialiased)
     flipped = np.abs(got.opacity - want.opacity) > PICTURE_TOLERANCE
@@ -124,9 +120,7 @@ def test_it_draws_the_definition(
     assert np.abs(got.depth - want.depth)[~flipped].max() < 7.0 * PICTURE_TOLERANCE
 
 
-def test_its_gradients_are_those_of_the_definition(
-    trainable: Implementation, gaussians: Gaussians, camera: CameraMaker, antialiased: bool
-) -> None:
+def test_its_gradients_are_those_of_the_definition(trainable, gaussians, antialiased):
     view_from = camera(61, 37)
     weights = np.random.default_rng(5).normal(size=(37, 61, 3)).astype(F32)
     got = trainable.draw(gaussians, view_from, antialiased)
@@ -138,9 +132,7 @@ def test_its_gradients_are_those_of_the_definition(
         assert error < GRADIENT_TOLERANCE, name
 
 
-def test_the_definition_never_leaves_the_device_of_its_parameters(
-    gaussians: Gaussians, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_definition_never_leaves_the_device_of_its_parameters(gaussians, monkeypatch):
     """The meta device computes shapes alone and refuses tensors of another device, like CUDA."""
 
     def all_of_them(mask: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ def is_dead(gaussians: Gaussians) -> np.ndarray:
     return gaussians.opacity_logits <= np.float32(-5.293305)
 
 
-def test_every_dead_gaussian_is_replaced_and_the_added_join_at_the_end() -> None:
+def test_every_dead_gaussian_is_replaced_and_the_added_join_at_the_end():
     start = many()
     rasterizer = TrainableRasterizer(start)
     replaced = rasterizer.control_density(DensityStep(added=37, seed=1))
@@ -54,7 +54,7 @@ def test_every_dead_gaussian_is_replaced_and_the_added_join_at_the_end() -> None
     assert not is_dead(after).any()
 
 
-def test_gaussians_nobody_drew_are_untouched() -> None:
+def test_gaussians_nobody_drew_are_untouched():
     start = many()
     rasterizer = TrainableRasterizer(start)
     rasterizer.control_density(DensityStep(added=1, seed=1))
@@ -63,7 +63,7 @@ def test_gaussians_nobody_drew_are_untouched() -> None:
 
 
 @pytest.mark.parametrize("copies", [1, 2, 7, 40])
-def test_parts_in_place_add_up_to_the_original_opacity(copies: int) -> None:
+def test_parts_in_place_add_up_to_the_original_opacity(copies):
     # 1 - (1 - part)^(copies + 1) = o (Kheradmand et al. 2024, eq. 9)
     rasterizer = TrainableRasterizer(one(2.0))
     rasterizer.control_density(DensityStep(added=copies, seed=1))
@@ -72,7 +72,7 @@ def test_parts_in_place_add_up_to_the_original_opacity(copies: int) -> None:
 
 
 @pytest.mark.parametrize("logit", [-2.0, 0.0, 2.0])
-def test_parts_in_place_are_as_wide_as_the_paper_says(logit: float) -> None:
+def test_parts_in_place_are_as_wide_as_the_paper_says(logit):
     from math import comb, sqrt
 
     rasterizer = TrainableRasterizer(one(logit))
@@ -89,7 +89,7 @@ def test_parts_in_place_are_as_wide_as_the_paper_says(logit: float) -> None:
 
 
 @pytest.mark.parametrize("in_place", [True, False])
-def test_splitting_hardly_changes_the_picture(in_place: bool) -> None:
+def test_splitting_hardly_changes_the_picture(in_place):
     rasterizer = TrainableRasterizer(one(1.0))
     before = rasterizer.forward(CAMERA).opacity
     rasterizer.control_density(DensityStep(added=1, seed=1, in_place=in_place))
@@ -100,7 +100,7 @@ def test_splitting_hardly_changes_the_picture(in_place: bool) -> None:
     assert after.sum() == pytest.approx(before.sum(), rel=0.02 if in_place else 0.12)
 
 
-def test_halves_lie_side_by_side_along_the_longest_axis() -> None:
+def test_halves_lie_side_by_side_along_the_longest_axis():
     rasterizer = TrainableRasterizer(one(0.0, (-3.0, -1.0, -2.0), (1.0, 0.0, 0.0, 0.0)))
     rasterizer.control_density(DensityStep(added=1, seed=1, in_place=False))
     halves = rasterizer.gaussians()
@@ -112,7 +112,7 @@ def test_halves_lie_side_by_side_along_the_longest_axis() -> None:
     np.testing.assert_allclose(halves.log_scales[:, [0, 2]], [[-3, -2]] * 2)
 
 
-def test_drawing_by_gradient_splits_the_one_the_pictures_pull_at() -> None:
+def test_drawing_by_gradient_splits_the_one_the_pictures_pull_at():
     start = many(64)
     start.means[:] += [0, 0, -20]  # behind the camera: no gradient
     start.means[9] = [0.1, 0, 3]
@@ -127,13 +127,13 @@ def test_drawing_by_gradient_splits_the_one_the_pictures_pull_at() -> None:
     assert not rasterizer.state().scores.any()
 
 
-def test_nothing_happens_when_none_is_alive() -> None:
+def test_nothing_happens_when_none_is_alive():
     rasterizer = TrainableRasterizer(one(-9.0))
     assert rasterizer.control_density(DensityStep(added=5, seed=1)) == 0
     assert len(rasterizer) == 1
 
 
-def test_noise_moves_the_faint_and_leaves_the_opaque() -> None:
+def test_noise_moves_the_faint_and_leaves_the_opaque():
     start = many()
     rasterizer = TrainableRasterizer(start)
     rasterizer.perturb(1.0, seed=3)
@@ -142,7 +142,7 @@ def test_noise_moves_the_faint_and_leaves_the_opaque() -> None:
     assert not moved[start.opacity_logits > -2].any()
 
 
-def test_noise_is_about_normal_in_the_gaussians_own_axes() -> None:
+def test_noise_is_about_normal_in_the_gaussians_own_axes():
     n = 4000
     values = (np.zeros((n, 3)), np.tile([1.0, 0, 0, 0], (n, 1)), np.tile([0.0, -1, -2], (n, 1)))
     sh = np.zeros((n, 1, 3))
@@ -155,7 +155,7 @@ def test_noise_is_about_normal_in_the_gaussians_own_axes() -> None:
     np.testing.assert_allclose(deviations, gate, rtol=4 / np.sqrt(2 * n))
 
 
-def test_removing_the_dead_keeps_the_others_in_order_with_their_moments() -> None:
+def test_removing_the_dead_keeps_the_others_in_order_with_their_moments():
     start = many()
     rasterizer = TrainableRasterizer(start)
     rasterizer.iterate(CAMERA, grey(), RATES)
@@ -179,7 +179,7 @@ def curve_order(means: np.ndarray) -> np.ndarray:
     return np.argsort(np.array(codes, np.uint64), kind="stable")
 
 
-def test_sorting_along_the_curve_takes_moments_and_scores_along() -> None:
+def test_sorting_along_the_curve_takes_moments_and_scores_along():
     rasterizer = TrainableRasterizer(many())
     rasterizer.keep_scores(True)
     rasterizer.iterate(CAMERA, grey(), RATES)
@@ -195,7 +195,7 @@ def test_sorting_along_the_curve_takes_moments_and_scores_along() -> None:
     np.testing.assert_array_equal(after.scores, before.scores[order])
 
 
-def test_gaussians_in_one_place_keep_their_order_on_the_curve() -> None:
+def test_gaussians_in_one_place_keep_their_order_on_the_curve():
     start = many(40)
     start.means[:] = [0.0, 0.0, 3.0]
     rasterizer = TrainableRasterizer(start)
@@ -203,7 +203,7 @@ def test_gaussians_in_one_place_keep_their_order_on_the_curve() -> None:
     assert values_of(rasterizer.gaussians()) == values_of(start)
 
 
-def test_no_gaussians_at_all_can_be_sorted() -> None:
+def test_no_gaussians_at_all_can_be_sorted():
     shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 16, 3))
     rasterizer = TrainableRasterizer(Gaussians(*(np.zeros(s, np.float32) for s in shapes)))
     rasterizer.order_along_curve()
@@ -224,7 +224,7 @@ def trained_bytes(isa: str, threads: int, by_gradient: bool, in_place: bool) -> 
 
 @pytest.mark.parametrize("by_gradient", [False, True])
 @pytest.mark.parametrize("in_place", [False, True])
-def test_every_instruction_set_and_thread_count_gives_the_same_bytes(by_gradient, in_place) -> None:
+def test_every_instruction_set_and_thread_count_gives_the_same_bytes(by_gradient, in_place):
     made = {
         trained_bytes(isa, threads, by_gradient, in_place)
         for isa in available_isas()
@@ -234,7 +234,7 @@ def test_every_instruction_set_and_thread_count_gives_the_same_bytes(by_gradient
 
 
 @pytest.mark.parametrize("pull", ["opacity_pull", "scale_pull"])
-def test_a_pull_lowers_what_it_pulls_at(pull: str) -> None:
+def test_a_pull_lowers_what_it_pulls_at(pull):
     def after(rates: LearningRates) -> Gaussians:
         rasterizer = TrainableRasterizer(one(1.0))
         rasterizer.forward(CAMERA)
@@ -251,6 +251,6 @@ def test_a_pull_lowers_what_it_pulls_at(pull: str) -> None:
 
 
 @pytest.mark.parametrize("change", [{"added": -1}, {"seed": -1}, {"seed": 1 << 64}])
-def test_steps_that_make_no_sense_are_refused(change: dict[str, int]) -> None:
+def test_steps_that_make_no_sense_are_refused(change):
     with pytest.raises(InvalidInput, match="density"):
         DensityStep(**{"added": 1, "seed": 1, **change})

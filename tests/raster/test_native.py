@@ -1,6 +1,5 @@
 """The native renderer: equal to the float64 definition, and to itself wherever it runs."""
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -10,14 +9,11 @@ import torch
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import BackendUnavailable, InvalidInput
-from rfcore.native.backend import available_isas
 from rfcore.raster import reference
 from rfcore.raster.gaussians import SKY_M, Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.views import View
-
-SceneMaker = Callable[..., Gaussians]
-CameraMaker = Callable[..., Camera]
+from tests.raster.conftest import camera, scene
 
 FORWARD_TOLERANCE = 1e-5
 """exp2 is good to 2.6e-6; weights sum to at most 1, colours here stay below 3."""
@@ -44,8 +40,8 @@ def forward_camera(width_px: int = 33, height_px: int = 17) -> Camera:
 
 
 def test_every_instruction_set_and_thread_count_gives_the_same_bytes(
-    scene: SceneMaker, camera: CameraMaker, forward_isa: str, threads: int, antialiased: bool
-) -> None:
+    forward_isa, threads, antialiased
+):
     definition = Rasterizer(scene(700), isa="scalar", antialiased=antialiased).render(camera())
     rasterizer = Rasterizer(scene(700), threads=threads, isa=forward_isa, antialiased=antialiased)
     view = rasterizer.render(camera())
@@ -54,9 +50,7 @@ def test_every_instruction_set_and_thread_count_gives_the_same_bytes(
     assert 0.2 < float(view.opacity.mean()) < 0.95
 
 
-def test_pictures_drawn_at_the_same_time_are_those_drawn_one_by_one(
-    scene: SceneMaker, camera: CameraMaker, threads: int
-) -> None:
+def test_pictures_drawn_at_the_same_time_are_those_drawn_one_by_one(threads):
     rasterizer = Rasterizer(scene(700), threads=threads)
     cameras = [camera(*size_px) for size_px in ((67, 45), (200, 120), (16, 16), (131, 99))]
     one_by_one = [view_bytes(rasterizer.render(each)) for each in cameras]
@@ -65,9 +59,7 @@ def test_pictures_drawn_at_the_same_time_are_those_drawn_one_by_one(
     assert together == one_by_one * 10
 
 
-def test_fields_of_any_size_are_drawn_in_the_same_memory(
-    scene: SceneMaker, camera: CameraMaker, threads: int
-) -> None:
+def test_fields_of_any_size_are_drawn_in_the_same_memory(threads):
     counts, small, large = (700, 40, 2000), camera(16, 16), camera(200, 120)
     alone = []
     for count in counts:  # with nothing left behind: it goes with the last that uses it
@@ -82,9 +74,7 @@ def test_fields_of_any_size_are_drawn_in_the_same_memory(
     assert in_turn == together == alone * 10
 
 
-def test_another_thread_count_of_the_same_gaussians_outlives_the_first(
-    scene: SceneMaker, camera: CameraMaker, threads: int, antialiased: bool
-) -> None:
+def test_another_thread_count_of_the_same_gaussians_outlives_the_first(threads, antialiased):
     first = Rasterizer(scene(700), threads=3, antialiased=antialiased)
     definition = view_bytes(first.render(camera()))
     own = first.with_threads(threads)
@@ -97,13 +87,7 @@ def test_another_thread_count_of_the_same_gaussians_outlives_the_first(
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("size_px", [(67, 45), (16, 16), (1, 1), (3, 50)])
-def test_colour_depth_and_opacity_follow_the_float64_definition(
-    scene: SceneMaker,
-    camera: CameraMaker,
-    degree: int,
-    size_px: tuple[int, int],
-    antialiased: bool,
-) -> None:
+def test_colour_depth_and_opacity_follow_the_float64_definition(degree, size_px, antialiased):
     gaussians, view_from = scene(200, degree), camera(*size_px)
     view = Rasterizer(gaussians, antialiased=antialiased).render(view_from)
     colour, depth, opacity = reference.render(
@@ -123,7 +107,7 @@ def assert_close_but_for_flips(
     assert np.abs(depth_error[~flipped]).max(initial=0) < 7.0 * FORWARD_TOLERANCE
 
 
-def test_one_gaussian_on_the_axis_has_the_value_of_algebra() -> None:
+def test_one_gaussian_on_the_axis_has_the_value_of_algebra():
     view = Rasterizer(on_axis()).render(forward_camera())
     variance_px2 = (40.0 * 0.2 / 4.0) ** 2 + 0.3
     colour = 0.5 + 0.28209479177387814
@@ -135,7 +119,7 @@ def test_one_gaussian_on_the_axis_has_the_value_of_algebra() -> None:
         assert view.depth[pixel] == pytest.approx(4.0, rel=1e-6)
 
 
-def test_the_sky_leaves_the_depth_of_a_surface_as_it_is_until_it_is_more_of_the_pixel() -> None:
+def test_the_sky_leaves_the_depth_of_a_surface_as_it_is_until_it_is_more_of_the_pixel():
     """Surfaces that let 40 and 60 % of an opaque sky through."""
     sky = on_axis(opacity_logit=20.0, depth_m=1e5, scale_m=1e5)
     for share, depth_m, opacity in ((0.4, SKY_M, 0.99 * 0.6), (0.6, 4.0, 0.6)):
@@ -147,28 +131,14 @@ def test_the_sky_leaves_the_depth_of_a_surface_as_it_is_until_it_is_more_of_the_
         assert view.colour[8, 16] == pytest.approx(alone.colour[8, 16] / share * 0.99, rel=0.02)
 
 
-def test_a_sky_without_anything_before_it_is_at_the_depth_of_the_sky() -> None:
+def test_a_sky_without_anything_before_it_is_at_the_depth_of_the_sky():
     view = Rasterizer(on_axis(depth_m=1.01 * SKY_M, scale_m=1e5)).render(forward_camera())
     assert (view.depth == SKY_M).all()
     np.testing.assert_allclose(view.opacity, 0.5, rtol=0.02)
     assert view.colour.min() > 0.3
 
 
-def test_an_empty_field_is_black_transparent_and_at_depth_zero() -> None:
-    empty = Gaussians(*(a[:0] for a in _arrays(on_axis())))
-    view = Rasterizer(empty).render(forward_camera())
-    assert not view.colour.any()
-    assert not view.opacity.any()
-    assert not view.depth.any()
-
-
-def test_a_field_behind_the_camera_draws_nothing(scene: SceneMaker) -> None:
-    turned = Camera(forward_camera().intrinsics, Pose((0, 0, -1), (0.0, 0.0, 1.0, 0.0)))
-    view = Rasterizer(scene(100)).render(turned)
-    assert not view.opacity.any()
-
-
-def test_splats_behind_an_opaque_wall_change_nothing(scene: SceneMaker) -> None:
+def test_splats_behind_an_opaque_wall_change_nothing():
     wall = on_axis(opacity_logit=20.0, depth_m=0.5, scale_m=50.0)
     walls = _joined(*[wall] * 6, degree=3)
     behind = _joined(*[wall] * 6, scene(300), degree=3)
@@ -176,37 +146,8 @@ def test_splats_behind_an_opaque_wall_change_nothing(scene: SceneMaker) -> None:
     assert view_bytes(Rasterizer(behind).render(forward_camera())) == view_bytes(alone)
 
 
-def test_the_order_of_the_input_matters_to_ties_only(
-    scene: SceneMaker, camera: CameraMaker
-) -> None:
-    gaussians = scene(400)
-    order = np.random.default_rng(7).permutation(400)
-    shuffled = Gaussians(*(np.ascontiguousarray(a[order]) for a in _arrays(gaussians)))
-    assert view_bytes(Rasterizer(shuffled).render(camera())) == view_bytes(
-        Rasterizer(gaussians).render(camera())
-    )
-
-
-def test_equal_depths_are_drawn_in_index_order() -> None:
-    red, blue = on_axis(3.0), on_axis(3.0)
-    red.sh[0, 0] = (1.5, -1.5, -1.5)
-    blue.sh[0, 0] = (-1.5, -1.5, 1.5)
-    first = Rasterizer(_joined(red, blue)).render(forward_camera()).colour[8, 16]
-    second = Rasterizer(_joined(blue, red)).render(forward_camera()).colour[8, 16]
-    assert first[0] > 5 * first[2]
-    assert second[2] > 5 * second[0]
-
-
-def test_colour_alone_is_the_colour_of_the_view(scene: SceneMaker, camera: CameraMaker) -> None:
-    rasterizer = Rasterizer(scene(300))
-    view = rasterizer.render(camera())
-    assert rasterizer.render_colour(camera()).tobytes() == view.colour.tobytes()
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_fewer_bands_are_the_picture_of_a_field_that_has_no_more(
-    scene: SceneMaker, camera: CameraMaker, forward_isa: str, degree: int
-) -> None:
+def test_fewer_bands_are_the_picture_of_a_field_that_has_no_more(forward_isa, degree):
     full = scene(300, 3)
     cut = replace(full, sh=np.ascontiguousarray(full.sh[:, : (degree + 1) ** 2]))
     want = Rasterizer(cut, isa=forward_isa).render(camera())
@@ -219,24 +160,12 @@ def test_fewer_bands_are_the_picture_of_a_field_that_has_no_more(
 
 
 @pytest.mark.parametrize("degree", [-1, 2, 7])
-def test_bands_a_field_lacks_are_refused(
-    scene: SceneMaker, camera: CameraMaker, degree: int
-) -> None:
+def test_bands_a_field_lacks_are_refused(degree):
     with pytest.raises(InvalidInput, match=f"sh_degree: {degree} is outside 0..1"):
         Rasterizer(scene(3, 1)).render(camera(), sh_degree=degree)
 
 
-def test_the_antialiased_mode_makes_gaussians_under_a_pixel_fainter() -> None:
-    small, camera = on_axis(scale_m=0.02), forward_camera()
-    sharp_px2 = (40.0 * 0.02 / 4.0) ** 2
-    plain = Rasterizer(small).render(camera).opacity
-    compensated = Rasterizer(small, antialiased=True).render(camera).opacity
-    assert compensated[8, 16] == pytest.approx(
-        plain[8, 16] * sharp_px2 / (sharp_px2 + 0.3), rel=1e-5
-    )
-
-
-def test_statistics_count_every_weight_of_a_picture() -> None:
+def test_statistics_count_every_weight_of_a_picture():
     statistics = Rasterizer(on_axis()).statistics(forward_camera())
     opacity = Rasterizer(on_axis()).render(forward_camera()).opacity
     assert statistics.visible == 1
@@ -244,19 +173,15 @@ def test_statistics_count_every_weight_of_a_picture() -> None:
     assert statistics.blends_per_px == pytest.approx(np.mean(opacity > 0))
 
 
-def test_an_instruction_set_this_machine_lacks_is_refused_by_name() -> None:
+def test_an_instruction_set_this_machine_lacks_is_refused_by_name():
     with pytest.raises(BackendUnavailable, match=r"'vax'.*scalar"):
         Rasterizer(on_axis(), isa="vax")
 
 
 @pytest.mark.parametrize("threads", [0, -1, 257])
-def test_a_number_of_threads_out_of_range_is_refused(threads: int) -> None:
+def test_a_number_of_threads_out_of_range_is_refused(threads):
     with pytest.raises(InvalidInput, match=f"threads: {threads}"):
         Rasterizer(on_axis(), threads=threads)
-
-
-def test_the_scalar_kernels_are_always_there() -> None:
-    assert available_isas()[-1] == "scalar"
 
 
 def _arrays(g: Gaussians) -> tuple[np.ndarray, ...]:
@@ -272,27 +197,7 @@ def _joined(*parts: Gaussians, degree: int = 0) -> Gaussians:
     return Gaussians(*(np.concatenate(column) for column in zip(*padded, strict=True)))
 
 
-def test_a_thousand_kilometres_from_its_origin_a_scene_is_drawn_as_at_home(
-    scene: SceneMaker, camera: CameraMaker
-) -> None:
-    """Means on the grid of 1/16 m that float32 has there, a camera turned and between grid points:
-    only the subtraction of its position is left to go wrong."""
-    gaussians, home = scene(300), camera()
-    gaussians.means[:] = np.round(gaussians.means * 16) / 16
-    away_m = (1e6, -1e6, 5e5)
-    moved = _arrays(gaussians)
-    moved = (moved[0] + np.float32(away_m), *moved[1:])
-    x, y, z = (a + b for a, b in zip(away_m, home.world_from_cam.translation_m, strict=True))
-    there = Camera(home.intrinsics, Pose((x, y, z), home.world_from_cam.rotation))
-    got = Rasterizer(Gaussians(*moved)).render(there)
-    want = Rasterizer(gaussians).render(home)
-    assert np.abs(got.colour - want.colour).max() < FORWARD_TOLERANCE
-    assert np.abs(got.opacity - want.opacity).max() < FORWARD_TOLERANCE
-
-
-def test_torch_runs_beside_the_threads_of_the_rasterizer(
-    scene: SceneMaker, camera: CameraMaker
-) -> None:
+def test_torch_runs_beside_the_threads_of_the_rasterizer():
     rasterizer = Rasterizer(scene(50), threads=2)
     before = view_bytes(rasterizer.render(camera()))
     torch.set_flush_denormal(True)

@@ -69,12 +69,12 @@ def trained_digest(antialiased: bool, isa: str | None = None) -> str:
     return digest(*(getattr(after, name) for name in FIELDS))
 
 
-def test_a_rendered_street_has_the_committed_bytes(forward_isa: str, antialiased: bool) -> None:
+def test_a_rendered_street_has_the_committed_bytes(forward_isa, antialiased):
     assert view_digest(antialiased, forward_isa) == VIEW_DIGESTS[antialiased]
 
 
 @pytest.mark.parametrize("isa", available_isas())
-def test_a_trained_street_has_the_committed_bytes(isa: str, antialiased: bool) -> None:
+def test_a_trained_street_has_the_committed_bytes(isa, antialiased):
     assert trained_digest(antialiased, isa) == TRAINED_DIGESTS[antialiased]
 
 

@@ -17,13 +17,12 @@ from rfcore.native.backend import available_isas
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
-from rfcore.raster.opencl.device import Build, Device, build_device, find_device
+from rfcore.raster.opencl.device import Device, build_device, find_device
 from rfcore.raster.opencl.renderer import DeviceRasterizer
 from rfcore.raster.opencl.self_check import (
     ARITHMETIC_DIGESTS,
     CHECKS,
     OPERATIONS,
-    Check,
     arithmetic_operands,
     bytes_of,
     canonical,
@@ -34,9 +33,8 @@ from rfcore.raster.opencl.self_check import (
 )
 from rfcore.raster.renderers import DEVICES
 from rfcore.views import FieldView, View
+from tests.raster.conftest import camera, scene
 
-SceneMaker = Callable[..., Gaussians]
-CameraMaker = Callable[..., Camera]
 F32 = np.float32
 
 FUZZED_SCENES, VIEWS_OF_A_SCENE = 60, 2
@@ -90,23 +88,22 @@ def fuzzed_camera(rng: np.random.Generator) -> Camera:
 
 @slow
 @pytest.mark.parametrize("isa", [OPENCL, GUARDED, WORST_CASE])
-def test_fuzzed_views_have_the_bytes_of_the_native_kernels(isa: str) -> None:
+def test_fuzzed_views_have_the_bytes_of_the_native_kernels(isa):
     device, covered = opened(isa), 0
     for seed in range(FUZZED_SCENES):
         rng = np.random.default_rng(seed)
         gaussians, antialiased = fuzzed_gaussians(rng), bool(rng.integers(0, 2))
         native = Rasterizer(gaussians, antialiased=antialiased)
-        for camera in [fuzzed_camera(rng) for _ in range(VIEWS_OF_A_SCENE)]:
-            want = native.render(camera)
-            assert view_bytes(view_on(device, gaussians, camera, antialiased)) == view_bytes(
-                want
-            ), seed
+        for at in [fuzzed_camera(rng) for _ in range(VIEWS_OF_A_SCENE)]:
+            want = native.render(at)
+            got = view_on(device, gaussians, at, antialiased)
+            assert view_bytes(got) == view_bytes(want), seed
             covered += int((want.opacity > 0).sum())
     assert covered > 1e6
 
 
 @slow
-def test_a_compiler_that_contracts_unasked_is_refused_by_its_picture(unguarded: Build) -> None:
+def test_a_compiler_that_contracts_unasked_is_refused_by_its_picture(unguarded):
     """Without it the tests of the worst build would show nothing.
 
     PoCL divides exactly in this build; NVIDIA's compiler does not and is refused before it draws.
@@ -116,7 +113,7 @@ def test_a_compiler_that_contracts_unasked_is_refused_by_its_picture(unguarded: 
         check_device(build_device(find_device(DEVICE), unguarded))
 
 
-def test_the_check_holds_devices_to_ieee_arithmetic() -> None:
+def test_the_check_holds_devices_to_ieee_arithmetic():
     x, y, z = arithmetic_operands()
     fused = ctypes.CDLL("libm.so.6").fmaf
     fused.argtypes, fused.restype = [ctypes.c_float] * 3, ctypes.c_float
@@ -132,7 +129,7 @@ def fused_all(fused: Callable[..., float], triples: object) -> np.ndarray:
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.want)
-def test_the_check_holds_devices_to_the_native_kernels(check: Check) -> None:
+def test_the_check_holds_devices_to_the_native_kernels(check):
     rasterizer = Rasterizer(check_gaussians(), antialiased=check.antialiased)
     view = rasterizer.render(check.camera, sh_degree=check.degree)
     assert digest(view.colour, view.depth, view.opacity) == check.want
@@ -142,9 +139,7 @@ def test_the_check_holds_devices_to_the_native_kernels(check: Check) -> None:
 @slow
 @pytest.mark.parametrize("isa", [OPENCL, GUARDED, WORST_CASE])
 @pytest.mark.parametrize("size_px", [(64, 48), (63, 47), (1, 1), (2, 5)])
-def test_a_device_makes_the_codecs_picture_of_what_it_draws(
-    isa: str, size_px: tuple[int, int], scene: SceneMaker
-) -> None:
+def test_a_device_makes_the_codecs_picture_of_what_it_draws(isa, size_px):
     width, height = size_px
     camera = Camera(Intrinsics(width, height, 40.0, 40.0, width / 2, height / 2), Pose.identity())
     gaussians = scene(500)
@@ -157,7 +152,7 @@ def test_a_device_makes_the_codecs_picture_of_what_it_draws(
 
 
 @slow
-def test_a_fields_view_is_the_same_from_a_device(scene: SceneMaker, camera: CameraMaker) -> None:
+def test_a_fields_view_is_the_same_from_a_device():
     """Also while the device is lost, and at half the size, where the CPU makes the picture."""
     fields = [SplatField(scene(2000), FieldMetadata(), isa=isa) for isa in (OPENCL, None)]
     for quality in (Quality(), Quality(scale=0.5)):
@@ -165,7 +160,6 @@ def test_a_fields_view_is_the_same_from_a_device(scene: SceneMaker, camera: Came
         assert bytes_of(views[0]) == bytes_of(views[1])
     assert fields[0].is_on_device
     device = fields[0].rasterizer(1.0)._device
-    assert device is not None
     device._kernels["codec_picture"] = until_gone(device._kernels["codec_picture"], iter(()))
     views = [render_field_view(field, camera()) for field in fields]
     assert bytes_of(views[0]) == bytes_of(views[1])
@@ -174,15 +168,13 @@ def test_a_fields_view_is_the_same_from_a_device(scene: SceneMaker, camera: Came
 
 
 @slow
-def test_an_opened_device_is_named_with_its_driver(scene: SceneMaker) -> None:
+def test_an_opened_device_is_named_with_its_driver():
     Rasterizer(scene(3), isa=OPENCL)
     assert ("PoCL" if DEVICE == "Portable" else DEVICE) in open_device(DEVICE).description
 
 
 @slow
-def test_another_thread_count_of_a_device_is_drawn_by_it_too(
-    scene: SceneMaker, camera: CameraMaker
-) -> None:
+def test_another_thread_count_of_a_device_is_drawn_by_it_too():
     first = Rasterizer(scene(3), isa=OPENCL)
     own = first.with_threads(2)
     assert own.isa == OPENCL
@@ -191,7 +183,7 @@ def test_another_thread_count_of_a_device_is_drawn_by_it_too(
 
 
 @slow
-def test_a_device_that_is_not_there_is_refused_by_name(scene: SceneMaker) -> None:
+def test_a_device_that_is_not_there_is_refused_by_name():
     with pytest.raises(BackendUnavailable, match=r"'voodoo'.*there is 0: "):
         Rasterizer(scene(3), isa="opencl:voodoo")
     with pytest.raises(BackendUnavailable, match="'99'"):
@@ -200,9 +192,7 @@ def test_a_device_that_is_not_there_is_refused_by_name(scene: SceneMaker) -> Non
 
 @slow
 @pytest.mark.parametrize("call", range(0, 40, 3))
-def test_a_device_removed_in_a_picture_costs_no_picture(
-    scene: SceneMaker, camera: CameraMaker, call: int
-) -> None:
+def test_a_device_removed_in_a_picture_costs_no_picture(call):
     """The device is gone from the ``call``-th command on; a picture has about 60."""
     gaussians = scene(3000)
     want = view_bytes(Rasterizer(gaussians).render(camera()))
@@ -210,7 +200,6 @@ def test_a_device_removed_in_a_picture_costs_no_picture(
     assert view_bytes(rasterizer.render(camera())) == want
     left = iter(range(call))
     device = rasterizer._device
-    assert device is not None
     for name, kernel in list(device._kernels.items()):
         device._kernels[name] = until_gone(kernel, left)
     lost = DEVICES.lost
@@ -227,9 +216,7 @@ def test_a_device_removed_in_a_picture_costs_no_picture(
     "quality",
     [Quality(0.5), Quality(0.1, sh_degree=1), Quality(scale=0.5), Quality(0.25, 0, None, 0.5)],
 )
-def test_every_reduced_quality_of_a_field_has_the_bytes_of_the_cpu(
-    scene: SceneMaker, camera: CameraMaker, quality: Quality, antialiased: bool
-) -> None:
+def test_every_reduced_quality_of_a_field_has_the_bytes_of_the_cpu(quality, antialiased):
     metadata = FieldMetadata(antialiased=antialiased)
     want = SplatField(scene(500), metadata).render(camera(130, 90), quality)
     field = SplatField(scene(500), metadata, isa=OPENCL)
@@ -239,9 +226,7 @@ def test_every_reduced_quality_of_a_field_has_the_bytes_of_the_cpu(
 
 
 @slow
-def test_threads_that_share_a_device_get_their_own_pictures(
-    scene: SceneMaker, camera: CameraMaker
-) -> None:
+def test_threads_that_share_a_device_get_their_own_pictures():
     """Two fields, the first with two threads; every thread turns its own way."""
     fields = [scene(900, seed=1), scene(700, seed=2)]
     devices = [Rasterizer(gaussians, isa=OPENCL) for gaussians in fields]
@@ -258,9 +243,7 @@ def test_threads_that_share_a_device_get_their_own_pictures(
 
 
 @slow
-def test_a_picture_too_large_for_the_device_is_drawn_by_the_cpu(
-    scene: SceneMaker, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_picture_too_large_for_the_device_is_drawn_by_the_cpu(monkeypatch):
     rasterizer = Rasterizer(scene(300), isa=OPENCL)
     want = view_bytes(rasterizer.render(camera()))
     with monkeypatch.context() as patch, capture_logs() as logs:
@@ -271,9 +254,7 @@ def test_a_picture_too_large_for_the_device_is_drawn_by_the_cpu(
 
 
 @slow
-def test_overlaps_are_counted_and_limited_as_by_the_native_kernels(
-    scene: SceneMaker, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_overlaps_are_counted_and_limited_as_by_the_native_kernels(monkeypatch):
     """They count overlaps with groups of 4x4 tiles; here they are counted anew from the tiles."""
     gaussians, view_from = scene(400), camera(517, 333)
     gaussians.log_scales[::7] += 2

@@ -4,7 +4,7 @@ The CPU's are held to their definition in tests/native/test_warp.py.
 """
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -30,11 +30,10 @@ from rfcore.native.warp import correct_i420, warp_i420
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.opencl.device import BUILDS, build_device, find_device
 from rfcore.raster.opencl.renderer import DeviceRasterizer
-from rfcore.raster.opencl.self_check import WARP_CASES, WarpCase, carried_on, check_device
+from rfcore.raster.opencl.self_check import WARP_CASES, carried_on, check_device
 from rfcore.views import FieldView, HeldFieldView
+from tests.raster.conftest import camera, scene
 
-SceneMaker = Callable[..., Gaussians]
-CameraMaker = Callable[..., Camera]
 F32 = np.float32
 FRAMES = 4
 
@@ -92,12 +91,12 @@ def assert_carried(
 
 @slow
 @every_build
-def test_any_warp_and_correction_has_the_bytes_of_the_cpu(isa: str) -> None:
-    assert_carried(isa)  # type: ignore[call-arg]
+def test_any_warp_and_correction_has_the_bytes_of_the_cpu(isa):
+    assert_carried(isa)
 
 
 @pytest.mark.parametrize("case", WARP_CASES, ids=lambda case: str(case.size_px))
-def test_the_check_has_something_to_carry(case: WarpCase) -> None:
+def test_the_check_has_something_to_carry(case):
     """But from behind, where everything is the render's."""
     previous, before, now = case.given()
     warped = warp_i420(previous, before, now)
@@ -122,9 +121,7 @@ def test_the_check_has_something_to_carry(case: WarpCase) -> None:
         ("render, 1, 255)", "render, 0, 255)"),
     ],
 )
-def test_a_device_that_carries_otherwise_is_refused(
-    monkeypatch: pytest.MonkeyPatch, right: str, wrong: str
-) -> None:
+def test_a_device_that_carries_otherwise_is_refused(monkeypatch, right, wrong):
     from rfcore.raster.opencl import device
 
     source = device._source()
@@ -182,8 +179,8 @@ def references(
     """Return all that is predicted from along a drive, as both ends make it."""
     made: list[bytes] = []
     past: Past | None = None
-    for number, camera in enumerate(cameras):
-        view = render_field_view(field, camera, qualities[number % len(qualities)])
+    for number, at in enumerate(cameras):
+        view = render_field_view(field, at, qualities[number % len(qualities)])
         prediction = Prediction(view, past)
         made.append(prediction.render.packed())
         if past is not None:
@@ -195,18 +192,14 @@ def references(
 @slow
 @pytest.mark.parametrize("isa", [OPENCL, WORST_CASE])
 @pytest.mark.parametrize("size_px", [(67, 45), (64, 48), (9, 1), (1, 7)])
-def test_references_of_a_drive_are_those_of_the_cpu(
-    isa: str, size_px: tuple[int, int], scene: SceneMaker, camera: CameraMaker
-) -> None:
+def test_references_of_a_drive_are_those_of_the_cpu(isa, size_px):
     cameras = drive(camera(*size_px))
     want = references(SplatField(scene(800)), cameras)
     assert references(SplatField(scene(800), isa=isa), cameras) == want
 
 
 @slow
-def test_only_pictures_cross_between_device_and_cpu(
-    scene: SceneMaker, camera: CameraMaker, traffic: Traffic
-) -> None:
+def test_only_pictures_cross_between_device_and_cpu(traffic):
     """Of a frame 1.5 bytes a pixel for each picture: down its render and the references that are
     made of it, up the earlier frame. The rest are counts, camera and poses."""
     field, cameras = SplatField(scene(800), isa=OPENCL), drive(camera(160, 90))
@@ -228,7 +221,7 @@ def test_only_pictures_cross_between_device_and_cpu(
 
 
 @slow
-def test_a_held_view_is_a_view_like_any_other(scene: SceneMaker, camera: CameraMaker) -> None:
+def test_a_held_view_is_a_view_like_any_other():
     fields = [SplatField(scene(800), isa=isa) for isa in (OPENCL, None)]
     view, want = (render_field_view(field, camera()) for field in fields)
     assert isinstance(view, HeldFieldView)
@@ -246,9 +239,7 @@ def test_a_held_view_is_a_view_like_any_other(scene: SceneMaker, camera: CameraM
 
 
 @slow
-def test_views_of_which_one_is_not_on_the_device_are_carried_by_the_cpu(
-    scene: SceneMaker, camera: CameraMaker
-) -> None:
+def test_views_of_which_one_is_not_on_the_device_are_carried_by_the_cpu():
     fields = [SplatField(scene(800), isa=isa) for isa in (None, OPENCL, WORST_CASE)]
     first, second = drive(camera(), 2)
     before, now = ([render_field_view(f, at) for f in fields] for at in (first, second))
@@ -261,9 +252,7 @@ def test_views_of_which_one_is_not_on_the_device_are_carried_by_the_cpu(
 
 @slow
 @pytest.mark.parametrize(("sender", "receiver"), [(None, OPENCL), (OPENCL, None), (OPENCL, OPENCL)])
-def test_a_drive_is_coded_alike_with_a_device_at_either_end(
-    scene: SceneMaker, camera: CameraMaker, sender: str | None, receiver: str | None
-) -> None:
+def test_a_drive_is_coded_alike_with_a_device_at_either_end(sender, receiver):
     ends = [SplatField(scene(800), isa=isa) for isa in (sender, receiver, None)]
     cameras = drive(camera(96, 64))
     encoder = DeltaEncoder(CodecConfig(96, 64))
@@ -289,7 +278,6 @@ def test_a_drive_is_coded_alike_with_a_device_at_either_end(
 
 def lose_kernels(field: SplatField, left: Iterator[int], _: pytest.MonkeyPatch) -> None:
     device = field.rasterizer(1.0)._device
-    assert device is not None
     device._kernels = {name: until_gone(k, left) for name, k in device._kernels.items()}
 
 
@@ -305,13 +293,7 @@ def lose_copies(_: SplatField, left: Iterator[int], monkeypatch: pytest.MonkeyPa
     [(lose_kernels, call) for call in range(0, 170, 13)]
     + [(lose_copies, call) for call in range(0, 60, 3)],
 )
-def test_a_device_lost_anywhere_costs_no_reference(
-    scene: SceneMaker,
-    camera: CameraMaker,
-    monkeypatch: pytest.MonkeyPatch,
-    lose: Callable[[SplatField, Iterator[int], pytest.MonkeyPatch], None],
-    call: int,
-) -> None:
+def test_a_device_lost_anywhere_costs_no_reference(monkeypatch, lose, call):
     """Depth that only the device had is drawn again, and carried by the CPU in that very frame. The
     drive has 174 kernels and 61 copies."""
     cameras = drive(camera())
@@ -325,9 +307,7 @@ def test_a_device_lost_anywhere_costs_no_reference(
 
 @slow
 @pytest.mark.parametrize("part", ["depth", "opacity"])
-def test_what_a_lost_device_had_is_drawn_again(
-    scene: SceneMaker, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch, part: str
-) -> None:
+def test_what_a_lost_device_had_is_drawn_again(monkeypatch, part):
     fields = [SplatField(scene(800), isa=isa) for isa in (OPENCL, None)]
     view, want = (render_field_view(field, camera()) for field in fields)
     lose_copies(fields[0], iter(()), monkeypatch)
@@ -336,15 +316,15 @@ def test_what_a_lost_device_had_is_drawn_again(
 
 
 @slow
-def test_planes_beyond_what_a_device_may_hold_come_back(
-    scene: SceneMaker, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_planes_beyond_what_a_device_may_hold_come_back(monkeypatch):
     """Three planes stay; the oldest pictures' are the CPU's, and those are carried there."""
     monkeypatch.setattr("rfcore.raster.opencl.renderer.MOST_HELD_BYTES", 3 * 4 * 67 * 45)
-    fields, cameras = [SplatField(scene(800), isa=isa) for isa in (OPENCL, None)], drive(camera())
+    fields, cameras = (
+        [SplatField(scene(800), isa=isa) for isa in (OPENCL, None)],
+        drive(camera()),
+    )
     held, want = ([render_field_view(field, at) for at in cameras] for field in fields)
     device = fields[0].rasterizer(1.0)._device
-    assert device is not None
     assert sum(each() is not None for each in device._held) == 3
     for view, other in zip(held, want, strict=True):
         picture = decoded(other, 0)
@@ -357,9 +337,7 @@ def test_planes_beyond_what_a_device_may_hold_come_back(
 
 
 @slow
-def test_buffers_of_dropped_views_are_used_again(
-    scene: SceneMaker, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_buffers_of_dropped_views_are_used_again(monkeypatch):
     import pyopencl as cl
 
     field, cameras, made = SplatField(scene(800), isa=OPENCL), drive(camera()), []
@@ -377,9 +355,7 @@ def test_buffers_of_dropped_views_are_used_again(
 
 @slow
 @pytest.mark.parametrize("most_planes", [1, 5, 1000])
-def test_streams_that_share_a_device_get_their_own_references(
-    scene: SceneMaker, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch, most_planes: int
-) -> None:
+def test_streams_that_share_a_device_get_their_own_references(monkeypatch, most_planes):
     """Each changes its level of detail, which another rasterizer draws; planes that make room for
     another stream's may be in use."""
     monkeypatch.setattr("rfcore.raster.opencl.renderer.MOST_HELD_BYTES", most_planes * 4 * 67 * 45)

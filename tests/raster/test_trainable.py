@@ -1,6 +1,5 @@
 """Training on the native kernels: gradients of the definition, deterministic steps."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +13,8 @@ from rfcore.raster import reference
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
+from tests.raster.conftest import camera, scene
 
-SceneMaker = Callable[..., Gaussians]
-CameraMaker = Callable[..., Camera]
 F32 = NDArray[np.float32]
 
 RATES = LearningRates(means=2e-3)
@@ -41,9 +39,7 @@ def array_bytes(g: Gaussians) -> bytes:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gradients_of_a_random_cotangent_follow_the_float64_definition(
-    scene: SceneMaker, camera: CameraMaker, degree: int, antialiased: bool
-) -> None:
+def test_gradients_of_a_random_cotangent_follow_the_float64_definition(degree, antialiased):
     gaussians, view_from = scene(120, degree), camera(61, 37)
     cotangent = np.random.default_rng(5).normal(size=(37, 61, 3)).astype(np.float32)
     native = TrainableRasterizer(gaussians, antialiased=antialiased)
@@ -58,34 +54,11 @@ def test_gradients_of_a_random_cotangent_follow_the_float64_definition(
     gradients = native.gradients()
     for name in NAMES:
         want = params[name].grad
-        assert want is not None
         assert relative_error(gradients[name], want.numpy()) < GRADIENT_TOLERANCE, name
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_gradients_of_needles_follow_the_float64_definition(
-    scene: SceneMaker, camera: CameraMaker, antialiased: bool
-) -> None:
-    """About pixels, moments and conic of a needle cancel: that was off by up to 23 %."""
-    gaussians, view_from = scene(40, 1), camera(61, 37)
-    gaussians.log_scales[::4] = (2.0, -18.0, -18.0) if not antialiased else (1.0, -4.0, -4.0)
-    cotangent = np.random.default_rng(5).normal(size=(37, 61, 3)).astype(np.float32)
-    native = TrainableRasterizer(gaussians, antialiased=antialiased)
-    native.forward(view_from)
-    native.backward(cotangent)
-    params = reference.parameters(gaussians, requires_grad=True)
-    colour, _, _ = reference.render(params, view_from, antialiased=antialiased)
-    (colour * torch.tensor(cotangent, dtype=torch.float64)).sum().backward()
-    for name, gradient in native.gradients().items():
-        want = params[name].grad
-        assert want is not None
-        assert relative_error(gradient, want.numpy()) < GRADIENT_TOLERANCE, name
-
-
 @pytest.mark.parametrize("size_px", [(61, 37), (16, 16), (5, 3), (1, 1), (33, 200)])
-def test_loss_and_its_gradient_follow_the_float64_definition(
-    scene: SceneMaker, camera: CameraMaker, size_px: tuple[int, int]
-) -> None:
+def test_loss_and_its_gradient_follow_the_float64_definition(size_px):
     gaussians, view_from = scene(60, 1), camera(*size_px)
     target = random_picture(view_from)
     native = TrainableRasterizer(gaussians, threads=2)
@@ -102,43 +75,7 @@ def test_loss_and_its_gradient_follow_the_float64_definition(
             assert relative_error(through_loss[name], direct[name]) < GRADIENT_TOLERANCE, name
 
 
-def test_gradients_agree_with_finite_differences_on_a_smooth_scene(
-    camera: CameraMaker, antialiased: bool
-) -> None:
-    """Wide translucent blobs: no alpha is near 1/255 or 0.99, so the picture is smooth."""
-    rng = np.random.default_rng(11)
-    f32 = np.float32
-    gaussians = Gaussians(
-        rng.uniform((-0.3, -0.3, 2.0), (0.3, 0.3, 3.0), (6, 3)).astype(f32),
-        rng.normal(size=(6, 4)).astype(f32),
-        rng.uniform(0.3, 0.7, (6, 3)).astype(f32),
-        rng.uniform(-1.0, 0.5, 6).astype(f32),
-        rng.normal(0, 0.3, (6, 4, 3)).astype(f32),
-    )
-    view_from = camera(19, 13)
-    cotangent = rng.normal(size=(13, 19, 3)).astype(f32)
-    native = TrainableRasterizer(gaussians, antialiased=antialiased)
-    native.forward(view_from)
-    native.backward(cotangent)
-    gradients = native.gradients()
-    params = reference.parameters(gaussians)
-    for name in NAMES:
-        direction = torch.tensor(rng.normal(size=params[name].shape))
-        step = 1e-5
-        values = []
-        for sign in (1.0, -1.0):
-            moved = {**params, name: params[name] + sign * step * direction}
-            picture = reference.render(moved, view_from, antialiased=antialiased)[0]
-            values.append(float((picture.numpy() * cotangent).sum()))
-        difference = (values[0] - values[1]) / (2 * step)
-        along = float((gradients[name] * direction.numpy()).sum())
-        scale = float(np.linalg.norm(gradients[name]) * np.linalg.norm(direction.numpy()))
-        assert abs(along - difference) < GRADIENT_TOLERANCE * scale, name
-
-
-def test_training_steps_are_byte_equal_everywhere(
-    scene: SceneMaker, camera: CameraMaker, isa: str, threads: int, antialiased: bool
-) -> None:
+def test_training_steps_are_byte_equal_everywhere(isa, threads, antialiased):
     def three_steps(isa: str, threads: int) -> tuple[list[float], bytes]:
         native = TrainableRasterizer(scene(200), threads=threads, isa=isa, antialiased=antialiased)
         view_from = camera(50, 140)
@@ -148,26 +85,14 @@ def test_training_steps_are_byte_equal_everywhere(
     assert three_steps(isa, threads) == three_steps("scalar", 1)
 
 
-def test_equal_pictures_have_a_loss_of_exactly_zero(scene: SceneMaker, camera: CameraMaker) -> None:
-    native = TrainableRasterizer(scene(80))
-    colour = native.forward(camera()).colour
-    assert native.loss(colour.copy()) == 0.0
-    native.backward()
-    assert max(float(np.abs(g).max()) for g in native.gradients().values()) < 1e-6
-
-
-def test_the_training_forward_is_the_rendering_forward(
-    scene: SceneMaker, camera: CameraMaker, antialiased: bool
-) -> None:
+def test_the_training_forward_is_the_rendering_forward(antialiased):
     for_training = TrainableRasterizer(scene(300), antialiased=antialiased).forward(camera())
     for_rendering = Rasterizer(scene(300), antialiased=antialiased).render(camera())
     assert for_training.colour.tobytes() == for_rendering.colour.tobytes()
     assert for_training.depth.tobytes() == for_rendering.depth.tobytes()
 
 
-def test_fewer_bands_render_as_if_the_others_were_zero(
-    scene: SceneMaker, camera: CameraMaker
-) -> None:
+def test_fewer_bands_render_as_if_the_others_were_zero():
     full = scene(100, 3)
     sh = full.sh.copy()
     sh[:, 4:] = 0
@@ -176,9 +101,7 @@ def test_fewer_bands_render_as_if_the_others_were_zero(
     assert np.abs(cut.colour - zeroed.colour).max() < 1e-6
 
 
-def test_one_step_is_adam_and_leaves_the_invisible_alone(
-    scene: SceneMaker, camera: CameraMaker
-) -> None:
+def test_one_step_is_adam_and_leaves_the_invisible_alone():
     gaussians = scene(90)
     gaussians.means[40:, 2] = -5
     native = TrainableRasterizer(gaussians)
@@ -195,7 +118,7 @@ def test_one_step_is_adam_and_leaves_the_invisible_alone(
     assert moved == pytest.approx(-RATES.means * np.sign(gradient["means"][:40]), abs=1e-6)
 
 
-def test_several_steps_follow_adam_in_float64(scene: SceneMaker, camera: CameraMaker) -> None:
+def test_several_steps_follow_adam_in_float64():
     native = TrainableRasterizer(scene(50, 0))
     start = native.gaussians().opacity_logits.astype(np.float64)
     m, v, value = np.zeros(50), np.zeros(50), start
@@ -212,14 +135,14 @@ def test_several_steps_follow_adam_in_float64(scene: SceneMaker, camera: CameraM
     assert native.gaussians().opacity_logits[seen] == pytest.approx(value[seen], abs=1e-5)
 
 
-def test_training_lowers_the_loss(scene: SceneMaker, camera: CameraMaker) -> None:
+def test_training_lowers_the_loss():
     target = Rasterizer(scene(150, seed=1)).render(camera()).colour
     native = TrainableRasterizer(scene(150, seed=2))
     losses = [native.iterate(camera(), target, RATES) for _ in range(60)]
     assert losses[-1] < 0.6 * losses[0]
 
 
-def test_iterate_is_the_four_calls_at_once(scene: SceneMaker, camera: CameraMaker) -> None:
+def test_iterate_is_the_four_calls_at_once():
     at_once, by_hand = TrainableRasterizer(scene(100)), TrainableRasterizer(scene(100))
     target = random_picture(camera())
     for _ in range(2):
@@ -231,13 +154,13 @@ def test_iterate_is_the_four_calls_at_once(scene: SceneMaker, camera: CameraMake
     assert array_bytes(at_once.gaussians()) == array_bytes(by_hand.gaussians())
 
 
-def test_parameters_survive_the_way_in_and_out(scene: SceneMaker) -> None:
+def test_parameters_survive_the_way_in_and_out():
     for count in (1, 16, 33):
         gaussians = scene(count, 2)
         assert array_bytes(TrainableRasterizer(gaussians).gaussians()) == array_bytes(gaussians)
 
 
-def test_calls_out_of_order_are_refused(scene: SceneMaker, camera: CameraMaker) -> None:
+def test_calls_out_of_order_are_refused():
     native = TrainableRasterizer(scene(5))
     with pytest.raises(InvalidInput, match=r"call forward\(\) first"):
         native.loss(random_picture(camera()))
@@ -248,12 +171,12 @@ def test_calls_out_of_order_are_refused(scene: SceneMaker, camera: CameraMaker) 
         native.adam_step(RATES)
 
 
-def test_targets_that_do_not_fit_are_refused(scene: SceneMaker, camera: CameraMaker) -> None:
+def test_targets_that_do_not_fit_are_refused():
     native = TrainableRasterizer(scene(5))
     native.forward(camera())
     target = random_picture(camera())
     with pytest.raises(InvalidInput, match="float64"):
-        native.loss(target.astype(np.float64))  # type: ignore[arg-type]
+        native.loss(target.astype(np.float64))
     with pytest.raises(InvalidInput, match="contiguous"):
         native.loss(target[:, ::-1])
     target[0, 0, 0] = np.nan
@@ -269,6 +192,6 @@ def test_targets_that_do_not_fit_are_refused(scene: SceneMaker, camera: CameraMa
         ({"epsilon": 0.0}, "rates"),
     ],
 )
-def test_bad_rates_are_refused_by_name(change: dict[str, float], named: str) -> None:
+def test_bad_rates_are_refused_by_name(change, named):
     with pytest.raises(InvalidInput, match=named):
         replace(RATES, **change)

@@ -3,7 +3,6 @@
 import base64
 import csv
 import re
-from pathlib import Path
 from xml.etree import ElementTree
 
 import av
@@ -63,7 +62,7 @@ def points(svg: str, colour: str) -> list[tuple[float, float]]:
     return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
-def test_bars_are_as_high_as_the_bytes_of_their_frames() -> None:
+def test_bars_are_as_high_as_the_bytes_of_their_frames():
     payload, packets = [1000, 2000, 500], [1300, 2300, 800]
     svg = bytes_chart(payload, packets)
     heights = bars(svg, PAYLOAD)[:3]
@@ -72,7 +71,7 @@ def test_bars_are_as_high_as_the_bytes_of_their_frames() -> None:
     assert headers == pytest.approx([0.3 * heights[0]] * 3, rel=1e-3)
 
 
-def test_quality_is_drawn_to_one_scale_for_reconstruction_and_render() -> None:
+def test_quality_is_drawn_to_one_scale_for_reconstruction_and_render():
     svg = quality_chart([34.0, 35.0, 36.0], [28.0, 28.0, 30.0])
     ours, render = points(svg, RECONSTRUCTION), points(svg, RENDER)
     per_db = ours[0][1] - ours[1][1]
@@ -83,14 +82,14 @@ def test_quality_is_drawn_to_one_scale_for_reconstruction_and_render() -> None:
     assert "render alone" in texts(svg)
 
 
-def test_a_training_curve_ends_in_its_figure() -> None:
+def test_a_training_curve_ends_in_its_figure():
     svg = curve_chart([(1.0, 20.0), (2.0, 25.0), (4.0, 27.125)])
     assert "27.12 dB" in texts(svg)
     (x0, _), (x1, _), (x2, _) = points(svg, PAYLOAD)
     assert (x2 - x1) / (x1 - x0) == pytest.approx(2.0, rel=1e-3)
 
 
-def test_every_stage_is_named_with_its_milliseconds_in_the_frames_order() -> None:
+def test_every_stage_is_named_with_its_milliseconds_in_the_frames_order():
     shown = texts(stages_chart({**STAGE_MS, "something else": 99.0}))
     for label, ms in zip(STAGES.values(), STAGE_MS.values(), strict=True):
         assert label in shown
@@ -101,7 +100,7 @@ def test_every_stage_is_named_with_its_milliseconds_in_the_frames_order() -> Non
     assert "99.0" not in shown
 
 
-def test_a_missing_stage_is_named() -> None:
+def test_a_missing_stage_is_named():
     partial = {k: v for k, v in STAGE_MS.items() if k not in ("link", "encode")}
     with pytest.raises(InvalidInput, match="no value for encode, link"):
         stages_chart(partial)
@@ -117,12 +116,12 @@ def test_a_missing_stage_is_named() -> None:
         lambda: curve_chart([]),
     ],
 )
-def test_nothing_to_draw_is_an_error(draw: object) -> None:
+def test_nothing_to_draw_is_an_error(draw):
     with pytest.raises(InvalidInput, match="give one or more of each"):
-        draw()  # type: ignore[operator]
+        draw()
 
 
-def test_equal_charts_are_equal_bytes_and_no_figure_stays_open() -> None:
+def test_equal_charts_are_equal_bytes_and_no_figure_stays_open():
     before = plt.get_fignums()
     for draw in (
         lambda: bytes_chart([1, 2], [3, 4]),
@@ -133,7 +132,7 @@ def test_equal_charts_are_equal_bytes_and_no_figure_stays_open() -> None:
     assert plt.get_fignums() == before
 
 
-def test_a_figure_has_its_numbers_beside_it_and_no_date(tmp_path: Path) -> None:
+def test_a_figure_has_its_numbers_beside_it_and_no_date(tmp_path):
     lines = [["scene", "ms"], ["a, b", "1.5"], ['say "c"', "2"]]
     for folder in ("one", "two"):
         figure, axes = plt.subplots()
@@ -148,7 +147,7 @@ def test_a_figure_has_its_numbers_beside_it_and_no_date(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lines", [[], [["a", "b"]], [["a", "b"], ["1"]]])
-def test_a_figure_without_its_numbers_is_refused(tmp_path: Path, lines: list[list[str]]) -> None:
+def test_a_figure_without_its_numbers_is_refused(tmp_path, lines):
     figure, _ = plt.subplots()
     with pytest.raises(InvalidInput, match="fig: its CSV needs"):
         write_figure(tmp_path / "fig", figure, lines)
@@ -156,7 +155,7 @@ def test_a_figure_without_its_numbers_is_refused(tmp_path: Path, lines: list[lis
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_difference_is_amplified_and_never_wraps() -> None:
+def test_a_difference_is_amplified_and_never_wraps():
     shown = np.array([[[0, 100, 255]]], np.uint8)
     camera = np.array([[[10, 90, 0]]], np.uint8)
     step = 10 * DIFFERENCE_GAIN
@@ -164,7 +163,7 @@ def test_a_difference_is_amplified_and_never_wraps() -> None:
     assert amplified_difference(camera, shown).tolist() == [[[128 + step, 128 - step, 0]]]
 
 
-def test_the_charts_of_the_frames_lie_in_one_frame() -> None:
+def test_the_charts_of_the_frames_lie_in_one_frame():
     """Side by side, frame k stands over frame k, and the axes at one height."""
     drawn = [bytes_chart([9, 8, 7], [10, 9, 8]), quality_chart([34.0, 35.0, 36.0], [28.0] * 3)]
     boxes = [parsed(svg).get("viewBox") for svg in drawn]
@@ -173,13 +172,13 @@ def test_the_charts_of_the_frames_lie_in_one_frame() -> None:
     assert axes[0] == axes[1] != []
 
 
-def test_pictures_are_embedded_whole_with_their_captions() -> None:
+def test_pictures_are_embedded_whole_with_their_captions():
     picture = np.full((16, 24, 3), 128, np.uint8)
     (entry,) = embedded([("camera <a>", picture)])
     assert entry["caption"] == "camera <a>"
     decoder = av.CodecContext.create("mjpeg", "r")
     packet = av.Packet(base64.b64decode(entry["data"]))
-    frames = [*decoder.decode(packet), *decoder.decode(None)]  # type: ignore[attr-defined]
+    frames = [*decoder.decode(packet), *decoder.decode(None)]
     (shown,) = [frame.to_ndarray(format="rgb24") for frame in frames]
     assert shown.shape == picture.shape
     assert np.abs(shown.astype(int) - 128).max() <= 3

@@ -20,7 +20,7 @@ def printed(
 ) -> str:
     console = Console(file=io.StringIO(), width=width, force_terminal=False)
     text_table(headings, rows, title).print(console)
-    text = console.file.getvalue()  # type: ignore[attr-defined]
+    text = console.file.getvalue()
     assert max(map(len, text.splitlines())) <= width
     return str(text)
 
@@ -28,7 +28,7 @@ def printed(
 # --- what a row declares
 
 
-def test_brackets_are_text_and_not_markup() -> None:
+def test_brackets_are_text_and_not_markup():
     assert "[bold]x[/]" in printed("[red]", ["a", "b"], [["[bold]x[/]", "1"], ["y", "2"]])
     assert "[red]" in printed("[red]", ["a"], [["x"], ["y"]])
 
@@ -41,7 +41,7 @@ LETTERS = st.text("abcdefgh0123456789.", min_size=1, max_size=12)
         lambda n: st.lists(st.tuples(*[LETTERS] * n), min_size=2, max_size=6, unique=True)
     )
 )
-def test_rows_that_differ_are_printed_as_different_lines(rows: list[tuple[str, ...]]) -> None:
+def test_rows_that_differ_are_printed_as_different_lines(rows):
     columns = [f"column{k}" for k in range(len(rows[0]))]
     text = printed("", columns, [list(row) for row in rows], width=400)
     lines = [tuple(re.findall(r"[\w.]+", x)) for x in text.splitlines() if x.startswith("│")]

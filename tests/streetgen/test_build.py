@@ -61,7 +61,7 @@ class QuickRenderer(SceneRenderer):
 
     def __init__(self, job: RenderJob) -> None:
         self._job = job
-        self._renderer = RoadRenderer()  # type: ignore[assignment]
+        self._renderer = RoadRenderer()
 
 
 @pytest.fixture(autouse=True)
@@ -83,7 +83,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in found if p.name != "manifest.json"}
 
 
-def test_a_build_is_read_back_as_it_was_taken(tmp_path: Path) -> None:
+def test_a_build_is_read_back_as_it_was_taken(tmp_path):
     build(tmp_path / "s", frames="0:19")
     shots = Selection(SCENE, "all", "0:19", SIZE_PX).shots()
     verify_manifest(tmp_path / "s")
@@ -100,7 +100,7 @@ def test_a_build_is_read_back_as_it_was_taken(tmp_path: Path) -> None:
     assert len(read_dataset(tmp_path / "s" / "transforms_drive_10hz.json").pictures) == 5
 
 
-def test_points_lie_on_the_pixels_that_show_them_at_their_depth(tmp_path: Path) -> None:
+def test_points_lie_on_the_pixels_that_show_them_at_their_depth(tmp_path):
     build(tmp_path / "s", splits="drive", frames="0:1")
     shot = Selection(SCENE, "drive", "0:1", SIZE_PX).shots()[0]
     found = ShotFiles.of(tmp_path / "s", shot)
@@ -115,13 +115,13 @@ def test_points_lie_on_the_pixels_that_show_them_at_their_depth(tmp_path: Path) 
         assert (rgb[int(v), int(u)] == colour).all()
 
 
-def test_depth_is_in_millimetres_and_zero_where_there_is_none() -> None:
+def test_depth_is_in_millimetres_and_zero_where_there_is_none():
     stored = depth_mm(np.array([[1.2344, 65.535, 65.536, np.inf]], np.float32))
     assert stored.tolist() == [[1234, 65535, 0, 0]]
     assert stored.dtype == np.uint16
 
 
-def test_a_build_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
+def test_a_build_goes_on_where_it_was_stopped(tmp_path):
     build(tmp_path / "whole", frames="0:6")
     build(tmp_path / "parts", frames="0:2")
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("parts/drive/*/00000[01].*")}
@@ -154,7 +154,7 @@ test.build(Path(sys.argv[2]), splits="drive", frames="0:6")
 """
 
 
-def test_a_build_that_was_killed_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+def test_a_build_that_was_killed_goes_on_to_the_same_bytes(tmp_path):
     """SIGKILL in the middle of the fourth frame, with a half-written picture left over."""
     command = [sys.executable, "-c", KILLED, __file__, str(tmp_path / "killed")]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -167,15 +167,13 @@ def test_a_build_that_was_killed_goes_on_to_the_same_bytes(tmp_path: Path) -> No
     verify_manifest(tmp_path / "killed")
 
 
-def test_a_full_disk_ends_in_one_error_and_leaves_whole_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_ends_in_one_error_and_leaves_whole_frames(tmp_path, monkeypatch):
     write = ShotFiles.write
 
     def full(self: ShotFiles, *values: object) -> None:
         if self.name == "000002":
             raise OSError(errno.ENOSPC, "No space left on device")
-        write(self, *values)  # type: ignore[arg-type]
+        write(self, *values)
 
     with monkeypatch.context() as until_space:
         until_space.setattr(ShotFiles, "write", full)
@@ -187,7 +185,7 @@ def test_a_full_disk_ends_in_one_error_and_leaves_whole_frames(
     assert len(read_dataset(tmp_path / "s").pictures) == 4
 
 
-def test_another_build_is_not_mixed_into_a_folder(tmp_path: Path) -> None:
+def test_another_build_is_not_mixed_into_a_folder(tmp_path):
     build(tmp_path / "s", frames="0:1")
     other = replace(SCENE, drive=replace(SCENE.drive, lane_offset_m=1.0))
     with pytest.raises(InvalidInput, match=r"holds another build \(differs in scene\)"):
@@ -199,7 +197,7 @@ def test_another_build_is_not_mixed_into_a_folder(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "letters").iterdir()] == ["to-mother.txt"]
 
 
-def test_measured_poses_stand_beside_the_true_ones(tmp_path: Path) -> None:
+def test_measured_poses_stand_beside_the_true_ones(tmp_path):
     noisy = replace(SCENE, pose_noise=LocalisationNoise(position_m=0.1))
     build(tmp_path / "s", noisy, splits="drive", frames="0:4")
     true, measured = (
@@ -214,7 +212,7 @@ def test_measured_poses_stand_beside_the_true_ones(tmp_path: Path) -> None:
     assert [frame["file_path"] for frame in true] == [frame["file_path"] for frame in measured]
 
 
-def test_a_lens_is_written_with_its_pictures(tmp_path: Path) -> None:
+def test_a_lens_is_written_with_its_pictures(tmp_path):
     bent = replace(SCENE, effects={"lens": LensDistortion(k1=-0.1)})
     build(tmp_path / "s", bent, splits="drive", frames="0:1")
     content = json.loads((tmp_path / "s" / "transforms.json").read_text())
@@ -226,23 +224,7 @@ def test_a_lens_is_written_with_its_pictures(tmp_path: Path) -> None:
     assert ((classes == 0) == np.isinf(depth_m)).all()
 
 
-def test_the_cost_is_said_before_it_starts(tmp_path: Path) -> None:
-    said = build(tmp_path / "s", splits="drive", frames="0:3")
-    cost, *progress = said.splitlines()
-    assert cost.startswith("3 frames, 16 samples a pixel: about")
-    assert [line.split(",")[0] for line in progress[:3]] == [f"{n} of 3 frames" for n in (1, 2, 3)]
-    assert progress[2].endswith("0 s left")
-
-
-def test_the_scalar_variant_is_said_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "chosen_backend", lambda _: Backend("scalar_rgb"))
-    first = build(tmp_path / "s", splits="drive", frames="0:1").splitlines()[0]
-    assert first == "no LLVM that Mitsuba can use (19 is known to work): scalar_rgb, 3-4x slower"
-
-
-def test_a_rig_is_recorded_with_a_file_that_the_agent_reads(tmp_path: Path) -> None:
+def test_a_rig_is_recorded_with_a_file_that_the_agent_reads(tmp_path):
     drive = DriveSettings(
         duration_s=0.3, rate_hz=10.0, thinned_hz=(), rig="mid_front,mid_back,low_left"
     )

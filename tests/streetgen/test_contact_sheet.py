@@ -22,7 +22,7 @@ def built(tmp_path: Path) -> Path:
     return tmp_path / "scene"
 
 
-def test_first_and_last_picture_are_on_the_sheet(built: Path) -> None:
+def test_first_and_last_picture_are_on_the_sheet(built):
     sheet = contact_sheet([built, built], columns=2, width_px=140)
     assert sheet.shape == (2 * (22 + 36 + 4), 140, 3)
     assert (sheet[22:58, 4:68] == 0).all()
@@ -30,12 +30,12 @@ def test_first_and_last_picture_are_on_the_sheet(built: Path) -> None:
     assert (sheet[:22] < 128).any(), "the scene is named"
 
 
-def test_fewer_pictures_than_columns_leave_room(built: Path) -> None:
+def test_fewer_pictures_than_columns_leave_room(built):
     sheet = contact_sheet([built], columns=8, width_px=600)
     assert (sheet[22:, -70:] == 250).all()
 
 
-def test_the_sheet_fits_its_limit(built: Path, tmp_path: Path) -> None:
+def test_the_sheet_fits_its_limit(built, tmp_path):
     out = tmp_path / "sheet.jpg"
     size = write_contact_sheet([built], out, columns=4, width_px=400, max_bytes=6000)
     assert size == out.stat().st_size <= 6000
@@ -45,7 +45,7 @@ def test_the_sheet_fits_its_limit(built: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "no.jpg").exists()
 
 
-def test_what_is_no_scene_is_refused(built: Path, tmp_path: Path) -> None:
+def test_what_is_no_scene_is_refused(built, tmp_path):
     with pytest.raises(DatasetError, match="no pictures in SPLIT/images"):
         contact_sheet([tmp_path], 4, 400)
     with pytest.raises(InvalidInput, match="columns: 90 of 400 px leave 0 px"):

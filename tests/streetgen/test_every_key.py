@@ -136,7 +136,7 @@ def posts_for_trees(layout: Layout, _rng: np.random.Generator) -> StreetPart:
     [(e, f.name) for e in EFFECTS for f in fields(load_effect(e))],
     ids=lambda value: value if isinstance(value, str) else value.name,
 )
-def test_a_key_of_an_effect_changes_what_it_makes(effect: Any, key: str) -> None:
+def test_a_key_of_an_effect_changes_what_it_makes(effect, key):
     settings = load_effect(effect)(**ON.get(key, {}))
     made = frame_digest if effect.on_frames else changed_digest
     assert made(settings, effect) != made(changed(settings, key), effect)
@@ -174,7 +174,7 @@ def frame_digest(settings: Any, effect: Any) -> str:
     ],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
-def test_a_key_of_a_part_changes_the_street_or_its_pictures(kind: type[Any], key: str) -> None:
+def test_a_key_of_a_part_changes_the_street_or_its_pictures(kind, key):
     if kind is LocalisationNoise:
         noise = LocalisationNoise(0.1, 1.0)
         pose = shots_of(SHORT, Split.DRIVE)[1].camera.world_from_cam

@@ -50,7 +50,7 @@ def somebody(request: pytest.FixtureRequest) -> Person:
     return Person(height_m=float(request.param))
 
 
-def test_a_loft_is_the_ellipsoid_it_is_given_and_looks_outwards() -> None:
+def test_a_loft_is_the_ellipsoid_it_is_given_and_looks_outwards():
     """With radii a, b and c the outward normal at (x, y, z) lies along (x/a2, y/b2, z/c2)."""
     radii = np.array([0.3, 0.2, 0.5])
     turn = np.linspace(-1.45, 1.45, 41)
@@ -68,12 +68,12 @@ def test_a_loft_is_the_ellipsoid_it_is_given_and_looks_outwards() -> None:
     assert ((np.cross(b - a, c - a) * (a + b + c)).sum(axis=1) > -1e-12).all()
 
 
-def test_a_loft_whose_sections_do_not_rise_is_refused() -> None:
+def test_a_loft_whose_sections_do_not_rise_is_refused():
     with pytest.raises(InvalidInput, match=r"loft.sections: heights \[0.0, 0.0\] do not rise"):
         loft(CLAY, [(0.0, 0.0, 1.0, 1.0), (0.0, 0.0, 0.5, 0.5)])
 
 
-def test_who_stands_is_as_tall_as_declared_and_alike_on_both_sides(somebody: Person) -> None:
+def test_who_stands_is_as_tall_as_declared_and_alike_on_both_sides(somebody):
     body = points(stood(body_parts(somebody), walking(somebody, 1.0, 0.0)))
     assert body[:, 2].min() == pytest.approx(0.0, abs=1e-6)
     assert body[:, 2].max() == pytest.approx(somebody.height_m, rel=0.01)
@@ -82,7 +82,7 @@ def test_who_stands_is_as_tall_as_declared_and_alike_on_both_sides(somebody: Per
 
 
 @pytest.mark.parametrize("swing", [0.3, 1.0, 1.3])
-def test_one_foot_is_always_on_the_ground_and_none_below_it(somebody: Person, swing: float) -> None:
+def test_one_foot_is_always_on_the_ground_and_none_below_it(somebody, swing):
     """The sole's edge is rounded by half a thousandth of the height."""
     parts = body_parts(somebody)
     for phase in PHASES:
@@ -94,7 +94,7 @@ def feet(somebody: Person, phase: float, swing: float) -> dict[BodyPart, F64]:
     return {k: v for k, v in walking(somebody, phase, swing).items() if k[0] == "foot"}
 
 
-def test_a_foot_on_the_ground_hardly_slides_while_the_body_passes_over_it() -> None:
+def test_a_foot_on_the_ground_hardly_slides_while_the_body_passes_over_it():
     """While the foot stands the ankle stays where it is on the ground, within 1 cm."""
     somebody = Person()
     stride = stride_m(somebody, 1.0)
@@ -108,7 +108,7 @@ def test_a_foot_on_the_ground_hardly_slides_while_the_body_passes_over_it() -> N
 
 
 @pytest.mark.parametrize("phase", PHASES[::4])
-def test_limbs_hang_together(somebody: Person, phase: float) -> None:
+def test_limbs_hang_together(somebody, phase):
     """The end of each limb is where the next begins, on foot and on a bicycle."""
     for pose in (walking(somebody, phase, 1.0), riding(Cyclist(somebody), phase)):
         for (limb, following), share in LINKS.items():
@@ -119,14 +119,14 @@ def test_limbs_hang_together(somebody: Person, phase: float) -> None:
             np.testing.assert_allclose(frame[:3, :3] @ frame[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-def test_knees_bend_back_and_elbows_forward(somebody: Person) -> None:
+def test_knees_bend_back_and_elbows_forward(somebody):
     for pose in (walking(somebody, phase, 1.0) for phase in PHASES):
         for side in SIDES:
             assert swung(pose["shank", side]) <= swung(pose["thigh", side])
             assert swung(pose["forearm", side]) >= swung(pose["upper arm", side])
 
 
-def test_arms_swing_against_their_legs() -> None:
+def test_arms_swing_against_their_legs():
     pose = walking(Person(), 0.0, 1.0)
     assert swung(pose["thigh", 1]) > 0 > swung(pose["thigh", -1])
     assert swung(pose["upper arm", 1]) < 0 < swung(pose["upper arm", -1])
@@ -136,7 +136,7 @@ def swung(frame: F64) -> float:
     return math.atan2(-frame[0, 2], frame[2, 2])
 
 
-def test_a_stride_repeats_itself_and_half_of_it_swaps_the_sides() -> None:
+def test_a_stride_repeats_itself_and_half_of_it_swaps_the_sides():
     somebody = Person()
     now, half, whole = (walking(somebody, p, 1.0) for p in (0.7, 0.7 + np.pi, 0.7 + 2 * np.pi))
     for (name, side), frame in now.items():
@@ -144,7 +144,7 @@ def test_a_stride_repeats_itself_and_half_of_it_swaps_the_sides() -> None:
         np.testing.assert_allclose(half[name, -side][[0, 2]], frame[[0, 2]], atol=1e-9)
 
 
-def test_wheels_touch_the_ground_and_roll_without_slipping() -> None:
+def test_wheels_touch_the_ground_and_roll_without_slipping():
     looks = Cyclist()
     rubber = placed(cyclist_parts(looks)["wheel"][0], riding(looks, 0.0)["wheel", 1])
     assert rubber.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-4)
@@ -156,7 +156,7 @@ def test_wheels_touch_the_ground_and_roll_without_slipping() -> None:
         assert abs(slip) < 1e-3 * step_m, "the point on the ground stands still"
 
 
-def test_feet_stay_on_the_pedals_and_legs_reach_them(somebody: Person) -> None:
+def test_feet_stay_on_the_pedals_and_legs_reach_them(somebody):
     looks = Cyclist(somebody)
     assert looks.hip_m[1] > 0.75
     for ridden_m in np.linspace(0, 5, 21):
@@ -171,7 +171,7 @@ def test_feet_stay_on_the_pedals_and_legs_reach_them(somebody: Person) -> None:
             np.testing.assert_allclose(arm[[0, 2]], pedal[[0, 2], 3], atol=1e-9)
 
 
-def test_hands_reach_the_grips(somebody: Person) -> None:
+def test_hands_reach_the_grips(somebody):
     looks = Cyclist(somebody)
     parts, pose = cyclist_parts(looks), riding(looks, 1.3)
     frame = points(list(parts["frame"]))
@@ -180,7 +180,7 @@ def test_hands_reach_the_grips(somebody: Person) -> None:
         assert np.linalg.norm(frame - hand[:3], axis=1).min() < 0.08
 
 
-def test_people_have_their_own_classes_and_keep_to_their_budget(somebody: Person) -> None:
+def test_people_have_their_own_classes_and_keep_to_their_budget(somebody):
     looks = Cyclist(somebody)
     on_foot = stood(body_parts(somebody), walking(somebody, 0.0, 1.0))
     mounted = stood(cyclist_parts(looks), riding(looks, 0.0))
@@ -191,7 +191,7 @@ def test_people_have_their_own_classes_and_keep_to_their_budget(somebody: Person
         assert sum(len(mesh.faces) for mesh in meshes) < BUDGET
 
 
-def test_chance_draws_people_that_differ_and_repeats_itself() -> None:
+def test_chance_draws_people_that_differ_and_repeats_itself():
     def draw() -> list[Cyclist]:
         rng = np.random.default_rng(1)
         return [Cyclist.drawn(rng) for _ in range(200)]

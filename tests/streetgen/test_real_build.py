@@ -21,7 +21,6 @@ from streetgen.render.renderer import Sampling
 from streetgen.scene_file import Scene
 from streetgen.shots import Selection
 
-ROOT = Path(__file__).parents[2]
 SHORT = """
 name = "short"
 field = "short"
@@ -50,7 +49,7 @@ def build(scene: Scene, out: Path, size_px: tuple[int, int], workers: int, frame
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_pose_looks_the_same_in_every_frame(standing: Scene, tmp_path: Path) -> None:
+def test_a_pose_looks_the_same_in_every_frame(standing, tmp_path):
     """The same place in frames 0 and 7 of the drive, in full size: at least 42 dB apart."""
     job = RenderJob(standing, tmp_path / "s", Sampling(16), chosen_backend(), 2, (640, 360))
     renderer = SceneRenderer(job)
@@ -64,7 +63,7 @@ def test_a_pose_looks_the_same_in_every_frame(standing: Scene, tmp_path: Path) -
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_two_workers_take_the_same_pictures_as_one(standing: Scene, tmp_path: Path) -> None:
+def test_two_workers_take_the_same_pictures_as_one(standing, tmp_path):
     for workers in (1, 2):
         build(standing, tmp_path / str(workers), (64, 36), workers, "0:4")
     one, two = (
@@ -78,14 +77,13 @@ def test_two_workers_take_the_same_pictures_as_one(standing: Scene, tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
     file = tmp_path / "driving.toml"
     file.write_text(SHORT.format(speed_mps=5.0))
     command = [sys.executable, "-m", "streetgen", "build", str(file)]
     command += ["--out", str(tmp_path / "s"), "--size", "64x36"]
     command += ["--split", "drive", "--workers", "2"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
         begun = any("1 of 4 frames" in line for line in parent.stdout)
         parent.kill()
         parent.stdout.read()  # ends when no worker holds it any more

@@ -35,7 +35,7 @@ def renderer(yard: World, fastest: Backend) -> PathTracer:
     return PathTracer(yard, Sampling(16), fastest, 1)
 
 
-def test_a_known_point_lands_on_its_pixel_at_its_depth(renderer: PathTracer) -> None:
+def test_a_known_point_lands_on_its_pixel_at_its_depth(renderer):
     """Depths of the floor, the box and the wall by algebra, at every pixel."""
     seen_by = camera()
     view = renderer.render(seen_by)
@@ -50,7 +50,7 @@ def test_a_known_point_lands_on_its_pixel_at_its_depth(renderer: PathTracer) -> 
     assert set(np.unique(view.labels)) == {0, Label.ROAD, Label.BUILDING, Label.VEHICLE}
 
 
-def test_unprojected_pixels_lie_on_the_surfaces_they_show(renderer: PathTracer) -> None:
+def test_unprojected_pixels_lie_on_the_surfaces_they_show(renderer):
     seen_by = camera(yaw_rad=0.3)
     view = renderer.render(seen_by)
     k = seen_by.intrinsics
@@ -61,9 +61,7 @@ def test_unprojected_pixels_lie_on_the_surfaces_they_show(renderer: PathTracer) 
     np.testing.assert_allclose(up, 0.0, atol=1e-3)
 
 
-def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
-    yard: World, renderer: PathTracer, fastest: Backend
-) -> None:
+def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(yard, renderer, fastest):
     first, later = renderer.render(camera()), renderer.render(camera(), time_s=3.0)
     two_threads = PathTracer(yard, Sampling(16), fastest, 2).render(camera())
     other_seed = PathTracer(yard, Sampling(16, seed=2), fastest, 2).render(camera())
@@ -74,7 +72,7 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
     assert first.colour.min() >= 0
 
 
-def test_the_scalar_variant_shows_the_same(yard: World, renderer: PathTracer) -> None:
+def test_the_scalar_variant_shows_the_same(yard, renderer):
     """The samples differ, so colours agree only to their noise; geometry agrees to rounding."""
     small = camera(32, 18)
     one, other = renderer.render(small), PathTracer(yard, Sampling(16), SCALAR, 1).render(small)
@@ -83,7 +81,7 @@ def test_the_scalar_variant_shows_the_same(yard: World, renderer: PathTracer) ->
     assert abs(one.colour - other.colour).mean() < 0.03 * one.colour.mean()
 
 
-def test_a_floor_in_the_sun_is_as_bright_as_radiometry_says(renderer: PathTracer) -> None:
+def test_a_floor_in_the_sun_is_as_bright_as_radiometry_says(renderer):
     """Reflectance / pi times irradiance: of the sun's disc, and of a uniform dome, pi L."""
     view = renderer.render(camera())
     half_angle = np.radians(0.53 / 2)
@@ -95,7 +93,7 @@ def test_a_floor_in_the_sun_is_as_bright_as_radiometry_says(renderer: PathTracer
     assert open_floor.mean() == pytest.approx(reflectance / np.pi * irradiance, rel=0.12)
 
 
-def test_what_moves_is_where_it_is_at_that_time(yard: World, fastest: Backend) -> None:
+def test_what_moves_is_where_it_is_at_that_time(yard, fastest):
     def along_y(time_s: float) -> np.ndarray:
         matrix = np.eye(4)
         matrix[1, 3] = -2.0 * time_s
@@ -111,12 +109,12 @@ def test_what_moves_is_where_it_is_at_that_time(yard: World, fastest: Backend) -
     assert middles[1] - middles[0] == pytest.approx(32 * 1.0 / 3.0, abs=1.0)
 
 
-def test_the_probes_program_renders() -> None:
+def test_the_probes_program_renders():
     subprocess.run([sys.executable, "-c", PROBE, "scalar_rgb"], check=True)
 
 
 @pytest.mark.parametrize("diameter_deg", [0.1, 0.53, 5.0])
-def test_the_painted_sun_gives_the_light_of_its_disc(diameter_deg: float) -> None:
+def test_the_painted_sun_gives_the_light_of_its_disc(diameter_deg):
     sky = Sky(np.zeros((64, 128, 3), np.float32), (0.6, 0.0, 0.8), (100.0,) * 3, diameter_deg)
     painted = with_sun(sky)
     rows = (np.arange(len(painted)) + 0.5) / len(painted) * np.pi
@@ -130,12 +128,12 @@ def test_the_painted_sun_gives_the_light_of_its_disc(diameter_deg: float) -> Non
 
 
 @pytest.mark.parametrize("samples", [0, 15, 5000])
-def test_samples_that_are_no_square_are_refused(samples: int) -> None:
+def test_samples_that_are_no_square_are_refused(samples):
     with pytest.raises(InvalidInput, match="not a square number"):
         Sampling(samples)
 
 
-def test_a_camera_off_its_middle_is_refused(renderer: PathTracer) -> None:
+def test_a_camera_off_its_middle_is_refused(renderer):
     k = replace(camera().intrinsics, cx_px=30.0)
     with pytest.raises(InvalidInput, match="about the middle"):
         renderer.render(Camera(k, Pose.identity()))

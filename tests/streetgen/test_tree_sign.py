@@ -32,8 +32,8 @@ def posted() -> StreetPart:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_tree_reaches_into_the_ground_and_is_as_tall_as_street_trees_are(kind: object) -> None:
-    meshes = grown(kind, rng())  # type: ignore[arg-type]
+def test_a_tree_reaches_into_the_ground_and_is_as_tall_as_street_trees_are(kind):
+    meshes = grown(kind, rng())
     bark, leaves = meshes
     assert (bark.material, leaves.material) == ("bark", "leaf")
     assert -0.1 < bark.vertices[:, 2].min() < 0
@@ -44,14 +44,14 @@ def test_a_tree_reaches_into_the_ground_and_is_as_tall_as_street_trees_are(kind:
     assert sum(len(mesh.faces) for mesh in meshes) < TREE_BUDGET
 
 
-def test_leaves_are_near_wood() -> None:
+def test_leaves_are_near_wood():
     bark, leaves = grown(KINDS[0], rng())
     some = leaves.vertices[::400]
     away = np.linalg.norm(some[:, None] - bark.vertices[None, ::3], axis=2).min(axis=1)
     assert np.quantile(away, 0.9) < 0.6
 
 
-def test_every_place_has_a_tree_in_a_pit(forest: StreetPart) -> None:
+def test_every_place_has_a_tree_in_a_pit(forest):
     soil = [mesh for mesh in forest.meshes if mesh.material == "soil"]
     assert len(soil) == len(LAYOUT.trees) > 5
     for mesh, place in zip(soil, LAYOUT.trees, strict=True):
@@ -60,7 +60,7 @@ def test_every_place_has_a_tree_in_a_pit(forest: StreetPart) -> None:
     assert {m.label for m in forest.meshes if m.material == "leaf"} == {Label.VEGETATION}
 
 
-def test_trees_and_signs_follow_from_the_seed(forest: StreetPart, posted: StreetPart) -> None:
+def test_trees_and_signs_follow_from_the_seed(forest, posted):
     for part, make in ((forest, trees), (posted, signs)):
         again, other = make(LAYOUT, rng()), make(LAYOUT, rng(3))
         assert same(part.meshes, again.meshes)
@@ -69,7 +69,7 @@ def test_trees_and_signs_follow_from_the_seed(forest: StreetPart, posted: Street
 
 
 @pytest.mark.parametrize("face", range(len(FACES)))
-def test_a_sign_hangs_on_a_post_that_reaches_into_the_ground(face: int) -> None:
+def test_a_sign_hangs_on_a_post_that_reaches_into_the_ground(face):
     meshes = post_of(face, 1)
     post = next(mesh for mesh in meshes if mesh.label == Label.POLE)
     assert post.vertices[:, 2].min() < -0.2
@@ -82,7 +82,7 @@ def test_a_sign_hangs_on_a_post_that_reaches_into_the_ground(face: int) -> None:
             assert np.abs(mesh.vertices[:, 0]).max() < 0.06, "it is clamped to its post"
 
 
-def test_all_posts_of_a_street_end_below_the_pavement(posted: StreetPart) -> None:
+def test_all_posts_of_a_street_end_below_the_pavement(posted):
     for mesh in posted.meshes:
         assert np.isfinite(mesh.vertices).all()
     posts = [m for m in posted.meshes if m.material == "sign post" and np.ptp(m.vertices[:, 2]) > 2]
@@ -90,7 +90,7 @@ def test_all_posts_of_a_street_end_below_the_pavement(posted: StreetPart) -> Non
     assert max(post.vertices[:, 2].min() for post in posts) < PAVEMENT_UP_M
 
 
-def test_lights_over_the_lane_hang_higher_than_a_truck() -> None:
+def test_lights_over_the_lane_hang_higher_than_a_truck():
     for lit in range(3):
         meshes = traffic_light(lit)
         over_lane = [m for m in meshes if m.vertices[:, 1].max() < -1.0]
@@ -101,7 +101,7 @@ def test_lights_over_the_lane_hang_higher_than_a_truck() -> None:
         assert len(on) == 1
 
 
-def test_a_signs_face_looks_at_who_drives_up_to_it(posted: StreetPart) -> None:
+def test_a_signs_face_looks_at_who_drives_up_to_it(posted):
     """On the left edge (y > 0) traffic comes from +x, on the right one from -x."""
     for mesh in posted.meshes:
         if mesh.material == "sign face":
@@ -110,7 +110,7 @@ def test_a_signs_face_looks_at_who_drives_up_to_it(posted: StreetPart) -> None:
             assert facing[0] * mesh.vertices[0, 1] > 0
 
 
-def test_letters_are_on_the_texture_and_differ() -> None:
+def test_letters_are_on_the_texture_and_differ():
     pictures = {text: face_picture(text) for text in FACES}
     assert len({p.tobytes() for p in pictures.values()}) == len(FACES)
     for text in ("30", "50"):
@@ -123,7 +123,7 @@ def test_letters_are_on_the_texture_and_differ() -> None:
     assert len({row.tobytes() for row in rows}) == len(NAMES)
 
 
-def test_a_round_sign_shows_its_own_face() -> None:
+def test_a_round_sign_shows_its_own_face():
     for text in ROUND:
         face = FACES.index(text)
         front = next(mesh for mesh in post_of(face, 0) if mesh.material == "sign face")

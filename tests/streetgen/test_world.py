@@ -27,7 +27,7 @@ def sky() -> Sky:
     return Sky(np.ones((4, 8, 3), np.float32))
 
 
-def test_a_placed_mesh_is_turned_scaled_and_moved() -> None:
+def test_a_placed_mesh_is_turned_scaled_and_moved():
     quarter = np.array([[0, -3, 0, 10], [3, 0, 0, 0], [0, 0, 3, 1], [0, 0, 0, 1]], float)
     smooth = faceted(triangle())
     moved = placed(smooth, quarter)
@@ -36,7 +36,7 @@ def test_a_placed_mesh_is_turned_scaled_and_moved() -> None:
     np.testing.assert_allclose(moved.normals, [[0, 0, 1]] * 3, atol=1e-6)
 
 
-def test_joined_meshes_have_all_triangles_of_each_material_and_label() -> None:
+def test_joined_meshes_have_all_triangles_of_each_material_and_label():
     far = placed(triangle(), np.eye(4) + np.eye(4, k=3) * 5)
     meshes = joined([triangle(), triangle("glass"), far, triangle("clay", Label.POLE)])
     assert [(m.material, m.label, len(m.faces)) for m in meshes] == [
@@ -56,12 +56,12 @@ def test_joined_meshes_have_all_triangles_of_each_material_and_label() -> None:
         ({"vertices": np.zeros((3, 3))}, "float64"),
     ],
 )
-def test_a_mesh_that_is_none_is_refused(change: dict[str, object], said: str) -> None:
+def test_a_mesh_that_is_none_is_refused(change, said):
     with pytest.raises(InvalidInput, match=said):
-        replace(triangle(), **change)  # type: ignore[arg-type]
+        replace(triangle(), **change)
 
 
-def test_a_world_has_the_materials_its_meshes_name() -> None:
+def test_a_world_has_the_materials_its_meshes_name():
     clay = Material("clay", (0.4, 0.3, 0.2))
     empty = World(Layout(Geometry()), sky())
     world = empty.plus(StreetPart((triangle(),), (clay,)))
@@ -81,13 +81,13 @@ def test_a_world_has_the_materials_its_meshes_name() -> None:
         ({"roughness": np.zeros((4, 4))}, "neither a number nor"),
     ],
 )
-def test_a_material_that_is_none_is_refused(values: dict[str, object], said: str) -> None:
+def test_a_material_that_is_none_is_refused(values, said):
     with pytest.raises(InvalidInput, match=said):
-        Material(**{"name": "m", "colour": (0, 0, 0), **values})  # type: ignore[arg-type]
+        Material(**{"name": "m", "colour": (0, 0, 0), **values})
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_nothing_stands_on_a_crossing_or_in_a_lamp(seed: int) -> None:
+def test_nothing_stands_on_a_crossing_or_in_a_lamp(seed):
     layout = Layout(Geometry(seed=seed, length_m=200.0))
     assert len(layout.crossings_x_m) >= 2
     for place in (*layout.trees, *layout.bays):
@@ -97,7 +97,7 @@ def test_nothing_stands_on_a_crossing_or_in_a_lamp(seed: int) -> None:
     assert Layout(layout.geometry).plots == layout.plots
 
 
-def test_plots_follow_one_another_without_overlap() -> None:
+def test_plots_follow_one_another_without_overlap():
     layout = Layout(Geometry())
     for side in (1, -1):
         row = [plot for plot in layout.plots if plot.side == side]

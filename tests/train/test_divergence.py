@@ -23,13 +23,13 @@ def feed(watch: DivergenceWatch, loss: float, begin: int, scale: float = 1.0) ->
         watch.see(iteration, loss, lambda: gaussians(scale))
 
 
-def test_a_loss_that_falls_or_wobbles_is_fine() -> None:
+def test_a_loss_that_falls_or_wobbles_is_fine():
     watch = DivergenceWatch()
     for window, loss in enumerate((0.4, 0.2, 0.1, 0.14, 0.1)):
         feed(watch, loss, 1 + window * WINDOW)
 
 
-def test_a_loss_above_where_it_began_stops_with_iteration_and_group() -> None:
+def test_a_loss_above_where_it_began_stops_with_iteration_and_group():
     watch = DivergenceWatch()
     feed(watch, 0.2, 1)
     feed(watch, 0.1, 101)
@@ -39,12 +39,12 @@ def test_a_loss_above_where_it_began_stops_with_iteration_and_group() -> None:
 
 
 @pytest.mark.parametrize("loss", [math.nan, math.inf])
-def test_a_loss_that_is_no_number_stops_at_once(loss: float) -> None:
+def test_a_loss_that_is_no_number_stops_at_once(loss):
     with pytest.raises(TrainingDiverged, match="iteration 7"):
         DivergenceWatch().see(7, loss, gaussians)
 
 
-def test_it_goes_on_from_what_it_knew() -> None:
+def test_it_goes_on_from_what_it_knew():
     watch, resumed = DivergenceWatch(), DivergenceWatch()
     feed(watch, 0.2, 1)
     resumed.restore(watch.values())
@@ -62,19 +62,19 @@ def test_it_goes_on_from_what_it_knew() -> None:
         ({"noise": math.nan}, "density.noise"),
     ],
 )
-def test_density_settings_that_make_no_sense_are_refused(change, named: str) -> None:
+def test_density_settings_that_make_no_sense_are_refused(change, named):
     with pytest.raises(InvalidInput, match=named):
         DensityControl(**change)
 
 
-def test_the_set_grows_to_its_limit_and_no_further() -> None:
+def test_the_set_grows_to_its_limit_and_no_further():
     control = DensityControl(limit=110, growth=0.08)
     assert control.step_after(100, 100, seed=0).added == 8
     assert control.step_after(200, 108, seed=0).added == 2
     assert control.step_after(300, 120, seed=0).added == 0
 
 
-def test_rounds_take_place_in_their_share_of_the_run_only() -> None:
+def test_rounds_take_place_in_their_share_of_the_run_only():
     control = DensityControl(limit=9, interval=10, start=0.2, stop=0.5)
     due = [i for i in range(1, 101) if control.is_due(i, i / 100)]
     assert due == [20, 30, 40]

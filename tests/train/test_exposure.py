@@ -15,7 +15,7 @@ from rfcore.train.trainer import mean_psnr_db
 CONFIG = SplatTrainingConfig(gaussians=400, iterations=600, bands=Bands(degree=0))
 
 
-def test_the_gradient_of_the_map_is_that_of_finite_differences(cameras, points) -> None:
+def test_the_gradient_of_the_map_is_that_of_finite_differences(cameras, points):
     from rfcore.train.start import gaussians_from_points
 
     start = gaussians_from_points(points, 300, 0.6, np.random.default_rng(0))
@@ -35,7 +35,7 @@ def test_the_gradient_of_the_map_is_that_of_finite_differences(cameras, points) 
     assert float((loss(0.0)[1] * direction).sum()) == pytest.approx(measured, rel=2e-2)
 
 
-def test_no_change_costs_nothing_and_changes_nothing(cameras, points) -> None:
+def test_no_change_costs_nothing_and_changes_nothing(cameras, points):
     from rfcore.train.start import gaussians_from_points
 
     start = gaussians_from_points(points, 300, 0.6, np.random.default_rng(0))
@@ -49,7 +49,7 @@ def test_no_change_costs_nothing_and_changes_nothing(cameras, points) -> None:
     np.testing.assert_array_equal(plain.gaussians().sh, mapped.gaussians().sh)
 
 
-def test_the_mean_map_stays_no_change() -> None:
+def test_the_mean_map_stays_no_change():
     model = ExposureModel(3)
     rng = np.random.default_rng(0)
     for view in (0, 1, 2, 0, 0, 1):
@@ -58,7 +58,7 @@ def test_the_mean_map_stays_no_change() -> None:
     np.testing.assert_allclose(mean, np.eye(3, 4), atol=1e-7)
 
 
-def test_pictures_of_two_exposures_make_one_field_of_the_mean(posed, cameras, points) -> None:
+def test_pictures_of_two_exposures_make_one_field_of_the_mean(posed, cameras, points):
     start = SplatTrainer(posed(lambda _: np.zeros((24, 40, 3), np.uint8)), points, CONFIG)
     truth = start.field()
     views = [200 * np.clip(truth.render_colour(camera), 0, 1) for camera in cameras]
@@ -73,6 +73,6 @@ def test_pictures_of_two_exposures_make_one_field_of_the_mean(posed, cameras, po
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (4, 3), (12,)])
-def test_a_map_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+def test_a_map_of_another_shape_is_refused(shape):
     with pytest.raises(InvalidInput, match=r"exposure\.affine"):
         Exposure(np.zeros(shape, np.float32), np.zeros((3, 4)))

@@ -17,13 +17,13 @@ def generator() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def test_the_spacing_of_a_grid_is_its_pitch() -> None:
+def test_the_spacing_of_a_grid_is_its_pitch():
     axes = [np.arange(4) * 0.25] * 3
     grid = np.stack(np.meshgrid(*axes), -1).reshape(-1, 3).astype(np.float32)
     np.testing.assert_allclose(spacing_m(grid), 0.25, rtol=1e-6)
 
 
-def test_a_search_through_all_pairs_agrees() -> None:
+def test_a_search_through_all_pairs_agrees():
     xyz_m = generator().normal(size=(200, 3)).astype(np.float32)
     distances = np.linalg.norm(xyz_m[:, None].astype(float) - xyz_m[None], axis=-1)
     want = np.sort(distances, axis=1)[:, 1:4].mean(axis=1)
@@ -47,7 +47,7 @@ def points_of_many_kinds() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", points_of_many_kinds())
-def test_spacing_is_that_of_opencvs_exact_tree_to_the_bit(kind: str) -> None:
+def test_spacing_is_that_of_opencvs_exact_tree_to_the_bit(kind):
     xyz_m = points_of_many_kinds()[kind].astype(np.float32)
     exact_tree = cv2.flann.Index(xyz_m, {"algorithm": 4})
     _, squared = exact_tree.knnSearch(xyz_m, min(4, len(xyz_m)), params={})
@@ -55,13 +55,13 @@ def test_spacing_is_that_of_opencvs_exact_tree_to_the_bit(kind: str) -> None:
     np.testing.assert_array_equal(spacing_m(xyz_m), want)
 
 
-def test_deviation_is_spacing_times_scale() -> None:
+def test_deviation_is_spacing_times_scale():
     line = np.arange(12)[:, None] * np.array([[0.5, 0, 0]])
     made = gaussians_from_points(cloud(line), 12, 0.6, generator())
     np.testing.assert_allclose(np.exp(made.log_scales[5]), 0.6 * (0.5 + 0.5 + 1.0) / 3, rtol=1e-5)
 
 
-def test_coincident_and_stray_points_get_a_finite_width() -> None:
+def test_coincident_and_stray_points_get_a_finite_width():
     made = gaussians_from_points(cloud(np.zeros((9, 3))), 9, 1.0, generator())
     np.testing.assert_allclose(np.exp(made.log_scales), 1e-3, rtol=1e-5)
     stray = np.vstack([generator().normal(size=(9, 3)), [[1e6, 0, 0]]])
@@ -69,13 +69,13 @@ def test_coincident_and_stray_points_get_a_finite_width() -> None:
     assert np.exp(made.log_scales).max() == pytest.approx(20.0)
 
 
-def test_a_gaussian_has_its_points_colour_from_every_side() -> None:
+def test_a_gaussian_has_its_points_colour_from_every_side():
     made = gaussians_from_points(cloud(generator().normal(size=(8, 3)), 51), 8, 1.0, generator())
     np.testing.assert_allclose(0.28209479 * made.sh[:, 0] + 0.5, 0.2, rtol=1e-6)
     assert not made.sh[:, 1:].any()
 
 
-def test_a_subset_is_drawn_without_repetition_and_by_seed() -> None:
+def test_a_subset_is_drawn_without_repetition_and_by_seed():
     points = cloud(generator().normal(size=(50, 3)))
     first, again = (gaussians_from_points(points, 20, 1.0, generator()).means for _ in range(2))
     other = gaussians_from_points(points, 20, 1.0, np.random.default_rng(1)).means
@@ -85,6 +85,6 @@ def test_a_subset_is_drawn_without_repetition_and_by_seed() -> None:
     assert len(gaussians_from_points(points, 999, 1.0, generator())) == 50
 
 
-def test_too_few_points_are_refused() -> None:
+def test_too_few_points_are_refused():
     with pytest.raises(InvalidInput, match="3 are too few, 4 or more"):
         gaussians_from_points(cloud(np.zeros((3, 3))), 3, 1.0, generator())

@@ -35,7 +35,7 @@ def error(field: SplatField, full: SplatField, detail: float) -> float:
     return float(np.sqrt(np.mean(np.square(differences))))
 
 
-def test_fitted_levels_show_the_full_field_better_than_prefixes(field: SplatField) -> None:
+def test_fitted_levels_show_the_full_field_better_than_prefixes(field):
     steps: list[tuple[int, int]] = []
     plain = with_levels(field, CAMERAS, LevelFitConfig(iterations=0))
     fitted = with_levels(
@@ -51,7 +51,7 @@ def test_fitted_levels_show_the_full_field_better_than_prefixes(field: SplatFiel
     assert fitted.metadata == field.metadata
 
 
-def test_the_same_field_and_cameras_give_the_same_levels(field: SplatField) -> None:
+def test_the_same_field_and_cameras_give_the_same_levels(field):
     ids = {
         with_levels(field, CAMERAS, LevelFitConfig(iterations=3, threads=threads)).field_id
         for threads in (1, 3)
@@ -59,13 +59,13 @@ def test_the_same_field_and_cameras_give_the_same_levels(field: SplatField) -> N
     assert len(ids) == 1
 
 
-def test_an_empty_field_has_empty_levels() -> None:
+def test_an_empty_field_has_empty_levels():
     nothing = Gaussians(*(np.zeros((0, *s), "f4") for s in ((3,), (4,), (3,), (), (1, 3))))
     empty = with_levels(SplatField(nothing), CAMERAS)
     assert not empty.render_colour(CAMERAS[0], Quality(0.1)).any()
 
 
 @pytest.mark.parametrize("wrong", [{"iterations": -1}, {"widening": 0.0}, {"opacity_rate": 2.0}])
-def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
+def test_settings_out_of_range_are_refused_by_name(wrong):
     with pytest.raises(InvalidInput, match=f"levels.{next(iter(wrong))}"):
-        LevelFitConfig(**wrong)  # type: ignore[arg-type]
+        LevelFitConfig(**wrong)

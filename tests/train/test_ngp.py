@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput, TrainingDiverged
-from rfcore.field import NgpField
 from rfcore.train.ngp import NgpModel, NgpSchedule, NgpTrainer, NgpTrainingConfig
-from rfcore.train.trainer import HeldOut, mean_psnr_db, read_checkpoint, write_checkpoint
+from rfcore.train.trainer import mean_psnr_db, read_checkpoint, write_checkpoint
 from rfcore.views import PointCloud
+from tests.train.conftest import PAINTS
 
 SMALL = NgpModel(
     L=6, log2_T=11, N_min=4, N_max=96, hidden=16, occupancy=20_000, steps_per_doubling=12
@@ -33,14 +32,14 @@ def trained(pictures, points=None, config=SHORT, seed: int = 0) -> NgpTrainer:
     return trainer
 
 
-def test_training_raises_the_quality_of_the_views(posed, points) -> None:
+def test_training_raises_the_quality_of_the_views(posed, points):
     pictures, config = posed(striped), replace(SHORT, iterations=150)
     before = NgpTrainer(pictures, points, config).field()
     after = trained(pictures, points, config).field()
     assert mean_psnr_db(after, pictures) > mean_psnr_db(before, pictures) + 6
 
 
-def test_a_dataset_without_points_starts_with_every_cell(posed) -> None:
+def test_a_dataset_without_points_starts_with_every_cell(posed):
     pictures = posed(striped)
     trainer = NgpTrainer(pictures, None, SHORT)
     first = trainer.step()
@@ -49,7 +48,7 @@ def test_a_dataset_without_points_starts_with_every_cell(posed) -> None:
     assert np.mean(losses[-8:]) < 0.5 * first.loss
 
 
-def test_points_say_which_cells_can_be_occupied(posed, points) -> None:
+def test_points_say_which_cells_can_be_occupied(posed, points):
     def occupied(trainer: NgpTrainer) -> int:
         words = trainer.field().numbers.occupancy
         return int(np.unpackbits(words.view(np.uint8)).sum())
@@ -60,21 +59,21 @@ def test_points_say_which_cells_can_be_occupied(posed, points) -> None:
 
 
 @pytest.mark.parametrize("change", [{}, {"threads": 2}, {"threads": 5, "isa": "scalar"}])
-def test_the_same_seed_gives_the_same_bytes(posed, points, change) -> None:
+def test_the_same_seed_gives_the_same_bytes(posed, points, change):
     config = replace(SHORT, iterations=12)
     first = trained(posed(striped), points, config).field(name="a")
     again = trained(posed(striped), points, replace(config, **change)).field(name="a")
     assert again.field_id == first.field_id
 
 
-def test_another_seed_gives_another_field(posed, points) -> None:
+def test_another_seed_gives_another_field(posed, points):
     config = replace(SHORT, iterations=3)
     first, other = (trained(posed(striped), points, config, seed=seed) for seed in (0, 1))
     assert first.field().field_id != other.field().field_id
     assert first.training_digest != other.training_digest
 
 
-def test_a_resumed_run_ends_with_the_same_bytes(posed, points, tmp_path) -> None:
+def test_a_resumed_run_ends_with_the_same_bytes(posed, points, tmp_path):
     through = NgpTrainer(posed(striped), points, SHORT)
     interrupted = NgpTrainer(posed(striped), points, SHORT)
     for _ in range(17):
@@ -89,41 +88,15 @@ def test_a_resumed_run_ends_with_the_same_bytes(posed, points, tmp_path) -> None
     assert resumed.field().field_id == through.field().field_id
 
 
-def test_a_checkpoint_of_another_run_is_refused(posed, points) -> None:
+def test_a_checkpoint_of_another_run_is_refused(posed, points):
     first = NgpTrainer(posed(striped), points, SHORT)
     other = NgpTrainer(posed(striped), points, SHORT, seed=1)
     with pytest.raises(InvalidInput, match="checkpoint"):
         other.restore(first.checkpoint())
 
 
-def test_the_field_says_where_it_comes_from(posed, points) -> None:
-    trainer = NgpTrainer(posed(striped), points, SHORT)
-    field = trainer.field("wall", TileOrigin(1.0, 2.0, 3.0), HeldOut(20.0, 0.5))
-    assert isinstance(field, NgpField)
-    assert field.metadata.kind == "ngp"
-    assert field.metadata.name == "wall"
-    assert field.metadata.tile_origin == TileOrigin(1.0, 2.0, 3.0)
-    assert field.metadata.training_digest == trainer.training_digest
-    assert field.metadata.held_out_psnr_db == 20.0
-    assert trainer.primitives == field.primitives
-
-
-def test_a_finished_run_refuses_another_step(posed, points) -> None:
-    trainer = trained(posed(striped), points, replace(SHORT, iterations=2))
-    assert trainer.finished
-    with pytest.raises(InvalidInput, match="all 2 iterations"):
-        trainer.step()
-
-
-PAINTS = {
-    "black": lambda _: np.zeros((24, 40, 3), np.uint8),
-    "white": lambda _: np.full((24, 40, 3), 255, np.uint8),
-    "noise": lambda i: np.random.default_rng(i).integers(0, 256, (24, 40, 3), dtype=np.uint8),
-}
-
-
 @pytest.mark.parametrize("paint", PAINTS.values(), ids=PAINTS.keys())
-def test_no_step_on_poison_makes_a_number_infinite(posed, paint) -> None:
+def test_no_step_on_poison_makes_a_number_infinite(posed, paint):
     far = np.array([[1e6, 0, 0], [0, 0, 3], [-0.4, 0, 0], [0, 0, 3]] * 4, np.float32)
     points = PointCloud(far, np.zeros((16, 3), np.uint8))
     config = replace(SHORT, schedule=NgpSchedule(rate=0.5, held_share=0.9))
@@ -151,6 +124,6 @@ def losses_until_it_diverges(trainer: NgpTrainer) -> Iterator[float]:
         (lambda: NgpSchedule(threshold=0.0), "training.threshold: 0"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused_by_name(make, named: str) -> None:
+def test_settings_that_make_no_sense_are_refused_by_name(make, named):
     with pytest.raises(InvalidInput, match=named):
         make()

@@ -38,9 +38,7 @@ def squares(view: int) -> np.ndarray:
 
 @pytest.mark.parametrize("config", [PLAIN, EVERYTHING, BY_GRADIENT], ids=["plain", "all", "grad"])
 @pytest.mark.parametrize("at", [1, 23])
-def test_a_resumed_run_gives_the_bytes_of_an_uninterrupted_one(
-    posed, points, tmp_path, config, at: int
-) -> None:
+def test_a_resumed_run_gives_the_bytes_of_an_uninterrupted_one(posed, points, tmp_path, config, at):
     pictures = posed(squares)
     whole = SplatTrainer(pictures, points, config, seed=4)
     list(whole.steps())
@@ -54,13 +52,13 @@ def test_a_resumed_run_gives_the_bytes_of_an_uninterrupted_one(
     assert resumed.field().field_id == whole.field().field_id
 
 
-def test_a_checkpoint_of_another_run_is_refused(posed, points) -> None:
+def test_a_checkpoint_of_another_run_is_refused(posed, points):
     one, other = (SplatTrainer(posed(squares), points, PLAIN, seed=seed) for seed in (1, 2))
     with pytest.raises(InvalidInput, match="same pictures, settings and seed"):
         other.restore(one.checkpoint())
 
 
-def test_a_damaged_checkpoint_is_refused(posed, points, tmp_path) -> None:
+def test_a_damaged_checkpoint_is_refused(posed, points, tmp_path):
     path = tmp_path / "run.ckpt"
     write_checkpoint(SplatTrainer(posed(squares), points, PLAIN).checkpoint(), path)
     data = bytearray(path.read_bytes())
@@ -70,7 +68,7 @@ def test_a_damaged_checkpoint_is_refused(posed, points, tmp_path) -> None:
         read_checkpoint(path)
 
 
-def test_a_field_is_no_checkpoint(posed, points, tmp_path) -> None:
+def test_a_field_is_no_checkpoint(posed, points, tmp_path):
     from rfcore.field import save_field
 
     path = tmp_path / "a.rff"

@@ -14,7 +14,7 @@ SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.timeout(900)
-def test_the_held_out_drive_of_the_sample_reaches_26_db() -> None:
+def test_the_held_out_drive_of_the_sample_reaches_26_db():
     train = read_dataset(SAMPLE / "transforms_train.json")
     held_out = read_dataset(SAMPLE / "transforms_drive_empty.json")
     assert train.points is not None

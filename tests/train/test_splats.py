@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.raster.gaussians import Gaussians
 from rfcore.train.schedule import DensityControl
 from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
-from rfcore.train.trainer import HeldOut, TrainingProgress, mean_psnr_db
+from rfcore.train.trainer import TrainingProgress, mean_psnr_db
 from rfcore.views import PointCloud
+from tests.train.conftest import PAINTS
 
 SHORT = SplatTrainingConfig(gaussians=300, iterations=60)
 
@@ -44,7 +44,7 @@ def painted(posed, cameras, points):
     return posed(lambda i: np.round(255 * views[i]).astype(np.uint8))
 
 
-def test_training_raises_the_quality_of_the_views(posed, cameras, points) -> None:
+def test_training_raises_the_quality_of_the_views(posed, cameras, points):
     pictures = painted(posed, cameras, points)
     config = replace(SHORT, iterations=150)
     before = SplatTrainer(pictures, points, config).field()
@@ -52,7 +52,7 @@ def test_training_raises_the_quality_of_the_views(posed, cameras, points) -> Non
     assert mean_psnr_db(after, pictures) > mean_psnr_db(before, pictures) + 6
 
 
-def test_progress_counts_every_iteration_and_the_loss_falls(posed, cameras, points) -> None:
+def test_progress_counts_every_iteration_and_the_loss_falls(posed, cameras, points):
     trainer = SplatTrainer(painted(posed, cameras, points), points, SHORT)
     progress = list(trainer.steps())
     assert [p.iteration for p in progress] == list(range(1, 61))
@@ -65,16 +65,14 @@ def test_progress_counts_every_iteration_and_the_loss_falls(posed, cameras, poin
 
 
 @pytest.mark.parametrize("change", [{}, {"threads": 2}, {"threads": 5}])
-def test_the_same_seed_gives_the_same_bytes(posed, points, change) -> None:
+def test_the_same_seed_gives_the_same_bytes(posed, points, change):
     pictures = posed(checked)
     first = trained(pictures, points).field(name="a")
     again = trained(pictures, points, replace(SHORT, **change)).field(name="a")
     assert again.field_id == first.field_id
 
 
-def test_gaussians_near_in_space_are_near_in_memory_from_the_start_and_after_growing(
-    posed, points
-) -> None:
+def test_gaussians_near_in_space_are_near_in_memory_from_the_start_and_after_growing(posed, points):
     def hop_m(trainer: SplatTrainer) -> float:
         return float(np.linalg.norm(np.diff(trainer.gaussians().means, axis=0), axis=1).mean())
 
@@ -92,7 +90,7 @@ def test_gaussians_near_in_space_are_near_in_memory_from_the_start_and_after_gro
     assert hop_m(trainer) < 0.8 * before_m
 
 
-def test_the_first_share_of_a_run_looks_at_halved_pictures(posed, points) -> None:
+def test_the_first_share_of_a_run_looks_at_halved_pictures(posed, points):
     """Halving a picture of 1 px squares leaves one grey: only whole pictures teach the squares."""
 
     def fine(_: int) -> np.ndarray:
@@ -104,23 +102,14 @@ def test_the_first_share_of_a_run_looks_at_halved_pictures(posed, points) -> Non
     assert max(losses[25:30]) < 0.25 * min(losses[30:35])
 
 
-def test_another_seed_gives_another_field(posed, points) -> None:
+def test_another_seed_gives_another_field(posed, points):
     pictures = posed(checked)
     first, other = (trained(pictures, points, seed=seed) for seed in (0, 1))
     assert first.field().field_id != other.field().field_id
     assert first.training_digest != other.training_digest
 
 
-def test_the_field_says_where_it_comes_from(posed, points) -> None:
-    trainer = SplatTrainer(posed(checked), points, SHORT)
-    field = trainer.field("wall", TileOrigin(1.0, 2.0, 3.0), held_out=HeldOut(20.0, 0.5))
-    assert field.metadata.name == "wall"
-    assert field.metadata.tile_origin == TileOrigin(1.0, 2.0, 3.0)
-    assert field.metadata.training_digest == trainer.training_digest
-    assert (field.metadata.held_out_psnr_db, field.metadata.held_out_ssim) == (20.0, 0.5)
-
-
-def test_gaussians_may_be_trained_further(posed, points) -> None:
+def test_gaussians_may_be_trained_further(posed, points):
     first = trained(posed(checked), points).gaussians()
     assert len(trained(posed(checked), first).gaussians()) == len(first)
 
@@ -148,16 +137,9 @@ def poisonous_points() -> PointCloud:
     return PointCloud(xyz, np.zeros((64, 3), np.uint8))
 
 
-PAINTS = {
-    "black": lambda _: np.zeros((24, 40, 3), np.uint8),
-    "white": lambda _: np.full((24, 40, 3), 255, np.uint8),
-    "noise": lambda i: np.random.default_rng(i).integers(0, 256, (24, 40, 3), dtype=np.uint8),
-}
-
-
 @pytest.mark.parametrize("paint", PAINTS.values(), ids=PAINTS.keys())
 @pytest.mark.parametrize("start", [poisonous_gaussians(), poisonous_points()], ids=["g", "p"])
-def test_no_step_on_poison_makes_a_parameter_infinite(posed, start, paint) -> None:
+def test_no_step_on_poison_makes_a_parameter_infinite(posed, start, paint):
     trainer = SplatTrainer(posed(paint), start, replace(SHORT, iterations=300))
     for progress in trainer.steps():
         assert np.isfinite(progress.loss)
@@ -165,7 +147,7 @@ def test_no_step_on_poison_makes_a_parameter_infinite(posed, start, paint) -> No
     assert trainer.finished
 
 
-def test_an_empty_field_against_grey_has_the_closed_form_quality(posed) -> None:
+def test_an_empty_field_against_grey_has_the_closed_form_quality(posed):
     nothing = Gaussians(
         *(np.zeros(s, np.float32) for s in ((0, 3), (0, 4), (0, 3), (0,), (0, 16, 3)))
     )
@@ -186,6 +168,6 @@ def test_an_empty_field_against_grey_has_the_closed_form_quality(posed) -> None:
         ({"initial_scale": float("nan")}, "training.initial_scale: nan"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused_by_name(change, named: str) -> None:
+def test_settings_that_make_no_sense_are_refused_by_name(change, named):
     with pytest.raises(InvalidInput, match=named):
         SplatTrainingConfig(**change)

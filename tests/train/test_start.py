@@ -32,7 +32,7 @@ def looking_inwards(count: int, radius_m: float) -> list[Camera]:
     return cameras
 
 
-def test_a_depth_map_of_a_wall_gives_points_on_the_wall() -> None:
+def test_a_depth_map_of_a_wall_gives_points_on_the_wall():
     half = np.pi / 8
     camera = Camera(K, Pose((1.0, -2.0, 0.5), (np.cos(half), 0.0, np.sin(half), 0.0)))
     cloud = points_from_depth(camera, paint(80), np.full((24, 40), 3.0, np.float32), 4)
@@ -45,7 +45,7 @@ def test_a_depth_map_of_a_wall_gives_points_on_the_wall() -> None:
     assert (cloud.rgb == 80).all()
 
 
-def test_pixels_without_depth_give_no_points() -> None:
+def test_pixels_without_depth_give_no_points():
     depth = np.zeros((24, 40), np.float32)
     depth[3, 5], depth[4, 6] = 2.0, np.nan
     camera = Camera(K, Pose((0, 0, 0), (1.0, 0, 0, 0)))
@@ -55,15 +55,15 @@ def test_pixels_without_depth_give_no_points() -> None:
 
 
 @pytest.mark.parametrize("radius_m", [0.5, 40.0])
-def test_cameras_in_a_circle_look_at_its_centre(radius_m: float) -> None:
+def test_cameras_in_a_circle_look_at_its_centre(radius_m):
     assert looking_distance_m(looking_inwards(7, radius_m)) == pytest.approx(radius_m)
 
 
-def test_cameras_side_by_side_have_a_distance_of_their_own(cameras) -> None:
+def test_cameras_side_by_side_have_a_distance_of_their_own(cameras):
     assert looking_distance_m(cameras) == 1.0
 
 
-def test_random_points_are_in_view_of_enough_cameras_and_coloured(posed) -> None:
+def test_random_points_are_in_view_of_enough_cameras_and_coloured(posed):
     pictures = posed(lambda i: paint(10 * i))
     cloud = random_points(pictures, 300, np.random.default_rng(0), RandomStart(seen_by=3))
     assert len(cloud.xyz_m) == 300
@@ -78,13 +78,13 @@ def test_random_points_are_in_view_of_enough_cameras_and_coloured(posed) -> None
     assert views.min() >= 3
 
 
-def test_the_same_generator_gives_the_same_points(posed) -> None:
+def test_the_same_generator_gives_the_same_points(posed):
     pictures = posed(lambda i: paint(10 * i))
     first, again = (random_points(pictures, 50, np.random.default_rng(2)) for _ in range(2))
     np.testing.assert_array_equal(first.xyz_m, again.xyz_m)
 
 
-def test_cameras_with_nothing_in_common_are_refused(posed) -> None:
+def test_cameras_with_nothing_in_common_are_refused(posed):
     from dataclasses import replace
 
     pictures = posed(lambda _: paint(0))
@@ -95,7 +95,7 @@ def test_cameras_with_nothing_in_common_are_refused(posed) -> None:
 
 
 @pytest.mark.parametrize("change", [{"nearest": 0.0}, {"farthest": 0.1}, {"seen_by": 0}])
-def test_settings_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
+def test_settings_that_make_no_sense_are_refused(change):
     with pytest.raises(InvalidInput, match="start"):
         RandomStart(**change)
 
@@ -124,7 +124,7 @@ def before_clouds(camera: Camera, wall_m: float = 3.0) -> Target:
     return Target(camera, np.round(picture).astype(np.uint8))
 
 
-def test_the_sky_is_where_pictures_from_places_apart_agree(cameras) -> None:
+def test_the_sky_is_where_pictures_from_places_apart_agree(cameras):
     sky = sky_gaussians([before_clouds(camera) for camera in cameras], 20_000, 0.6, sh_degree=2)
     towards = sky.means.astype(np.float64) / np.linalg.norm(sky.means, axis=1, keepdims=True)
     x, y, z = towards.T
@@ -138,19 +138,19 @@ def test_the_sky_is_where_pictures_from_places_apart_agree(cameras) -> None:
     assert sky.means[:, 2].min() > SKY_M
 
 
-def test_no_sky_is_seen_from_one_place(cameras) -> None:
+def test_no_sky_is_seen_from_one_place(cameras):
     """There all agree about everything."""
     assert len(sky_gaussians([before_clouds(cameras[0])] * 3, 5000, 0.6)) == 0
 
 
-def test_a_wall_that_fills_all_pictures_is_no_sky(cameras) -> None:
+def test_a_wall_that_fills_all_pictures_is_no_sky(cameras):
     rng = np.random.default_rng(3)
     noise = [Target(c, rng.integers(0, 256, (24, 40, 3), dtype=np.uint8)) for c in cameras]
     assert len(sky_gaussians(noise, 5000, 0.6)) < 5
 
 
 @pytest.mark.parametrize("directions", [1, 3, 4096, 9000])
-def test_directions_are_spread_evenly(directions: int) -> None:
+def test_directions_are_spread_evenly(directions):
     """Of a smooth white everything all directions in view are kept: their share of the sphere."""
     at = [Camera(K, Pose((x, 0.0, 0.0), (1.0, 0, 0, 0))) for x in (0.0, 5.0)]
     sky = sky_gaussians([Target(camera, paint(255)) for camera in at], directions, 0.6)

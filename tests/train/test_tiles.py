@@ -1,14 +1,11 @@
 """``rfedge train`` of the tiles of a split: here or on Ray, killed or not, the same bytes."""
 
-import json
 import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from lab.servers.ray import require_resumed, train_tiles
@@ -17,6 +14,7 @@ from rfcore.wire.tile_manifest import read_publication
 from rfedge.cli.field_tiles import FieldPublish
 from rfedge.cli.train import Train
 from rfedge.datasets.convert import SplitSettings, split_dataset
+from tests.train.conftest import write_drive
 
 OPTIONS = {"iterations": 60, "gaussians": 200, "threads": 1, "plain": True, "checkpoint_every": 20}
 
@@ -24,18 +22,7 @@ OPTIONS = {"iterations": 60, "gaussians": 200, "threads": 1, "plain": True, "che
 @pytest.fixture(scope="session")
 def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two tiles of a drive past a painted wall."""
-    folder = tmp_path_factory.mktemp("drive")
-    frames = []
-    for i in range(16):
-        u = (np.arange(48) + 0.5 - 24) / 10 + 0.2 * i
-        v = (np.arange(32) + 0.5 - 16) / 10
-        level = 128 + 60 * np.sin(3 * u)[None] * np.cos(2 * v)[:, None]
-        cv2.imwrite(str(folder / f"{i}.png"), np.repeat(level[..., None], 3, axis=2).astype("u1"))
-        matrix = np.eye(4)
-        matrix[0, 3] = 0.2 * i
-        frames.append({"file_path": f"{i}.png", "transform_matrix": matrix.tolist()})
-    k = {"fl_x": 40.0, "fl_y": 40.0, "cx": 24.0, "cy": 16.0, "w": 48, "h": 32}
-    (folder / "transforms.json").write_text(json.dumps({**k, "frames": frames}))
+    folder = write_drive(tmp_path_factory.mktemp("drive"), [0.2 * i for i in range(16)])
     split_dataset(folder, folder / "split", SplitSettings(1.5, 0.4))
     return folder / "split"
 
@@ -49,14 +36,14 @@ def trained(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def verb(split: Path, out: Path) -> Train:
-    return replace(Train(split, out), **OPTIONS)  # type: ignore[arg-type]
+    return replace(Train(split, out), **OPTIONS)
 
 
 def fields_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.glob("*.rff")}
 
 
-def test_every_tile_gets_a_field_and_its_checkpoint_is_gone(trained: Path) -> None:
+def test_every_tile_gets_a_field_and_its_checkpoint_is_gone(trained):
     names = {"tile-0-0", "tile-1-0"}
     assert {path.name for path in trained.iterdir()} == {
         "tiles.json",
@@ -66,8 +53,8 @@ def test_every_tile_gets_a_field_and_its_checkpoint_is_gone(trained: Path) -> No
 
 
 def test_tiles_that_are_trained_are_skipped_and_with_other_settings_trained_again(
-    split: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    split, trained, tmp_path, capsys
+):
     out = tmp_path / "out"
     out.mkdir()
     for path in trained.iterdir():
@@ -79,9 +66,7 @@ def test_tiles_that_are_trained_are_skipped_and_with_other_settings_trained_agai
     assert fields_of(out) != fields_of(trained)
 
 
-def test_one_tile_that_cannot_be_trained_does_not_stop_the_other(
-    split: Path, trained: Path, tmp_path: Path
-) -> None:
+def test_one_tile_that_cannot_be_trained_does_not_stop_the_other(split, trained, tmp_path):
     broken = tmp_path / "split"
     for path in split.rglob("*"):
         if path.is_file():
@@ -104,33 +89,29 @@ def test_one_tile_that_cannot_be_trained_does_not_stop_the_other(
         ({"out": Path("a.rff")}, "out: a.rff must be a folder"),
     ],
 )
-def test_what_one_dataset_takes_is_refused_for_tiles(
-    split: Path, tmp_path: Path, changed: dict[str, object], message: str
-) -> None:
+def test_what_one_dataset_takes_is_refused_for_tiles(split, tmp_path, changed, message):
     with pytest.raises(InvalidInput, match=message):
-        replace(verb(split, tmp_path), **changed).run()  # type: ignore[arg-type]
+        replace(verb(split, tmp_path), **changed).run()
 
 
-def test_one_dataset_is_not_trained_on_ray(split: Path, tmp_path: Path) -> None:
+def test_one_dataset_is_not_trained_on_ray(split, tmp_path):
     one = replace(verb(split / "tile-0-0", tmp_path / "a.rff"), ray="local")
     with pytest.raises(InvalidInput, match=r"ray: trains tiles, and .* has no tiles\.json"):
         one.run()
 
 
-def test_trained_tiles_are_published_for_their_ground(trained: Path, tmp_path: Path) -> None:
+def test_trained_tiles_are_published_for_their_ground(trained, tmp_path):
     FieldPublish(trained, tmp_path).run()
     tiles = read_publication(tmp_path).tiles
     assert set(tiles) == {"tile-0-0", "tile-1-0"}
     west, east = tiles["tile-0-0"].area, tiles["tile-1-0"].area
-    assert west is not None
-    assert east is not None
     assert west.high_m[0] == east.low_m[0] == pytest.approx(1.5)
     assert tiles["tile-0-0"].margin_m == 0.2
     with pytest.raises(InvalidInput, match="tile: goes with one field"):
         FieldPublish(trained, tmp_path, tile="other").run()
 
 
-def test_nothing_is_published_where_a_tile_is_missing(trained: Path, tmp_path: Path) -> None:
+def test_nothing_is_published_where_a_tile_is_missing(trained, tmp_path):
     for name in ("tiles.json", "tile-0-0.rff"):
         (tmp_path / name).write_bytes((trained / name).read_bytes())
     with pytest.raises(InvalidInput, match=r"tile-1-0\.rff is missing"):
@@ -139,9 +120,7 @@ def test_nothing_is_published_where_a_tile_is_missing(trained: Path, tmp_path: P
 
 
 @pytest.mark.slow
-def test_on_ray_the_fields_are_the_same_bytes_also_when_a_worker_is_killed(
-    split: Path, tmp_path: Path
-) -> None:
+def test_on_ray_the_fields_are_the_same_bytes_also_when_a_worker_is_killed(split, tmp_path):
     options = ["--iterations", "4000", "--gaussians", "200", "--threads", "1", "--plain"]
     options += ["--checkpoint-every", "20"]
     here, there = tmp_path / "here", tmp_path / "there"
@@ -154,7 +133,7 @@ def test_on_ray_the_fields_are_the_same_bytes_also_when_a_worker_is_killed(
     assert len(fields_of(here)) == 2
 
 
-def test_without_the_option_ray_is_not_imported(split: Path, tmp_path: Path) -> None:
+def test_without_the_option_ray_is_not_imported(split, tmp_path):
     code = "import sys; from rfedge.cli import main; end = main(); print('ray' in sys.modules)"
     run = partial(subprocess.run, capture_output=True, text=True, check=True)
     done = run([sys.executable, "-c", code, "train", str(split), "--out", str(tmp_path / "out"),

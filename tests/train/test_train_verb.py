@@ -24,6 +24,7 @@ from rfedge.training.views import (
     share_of_views,
     split_every,
 )
+from tests.train.conftest import write_drive
 
 VIEWS = 8
 
@@ -31,21 +32,8 @@ VIEWS = 8
 @pytest.fixture(scope="session")
 def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A transforms.json of eight pictures of a painted wall, without points."""
-    folder = tmp_path_factory.mktemp("wall")
-    frames = []
-    for i in range(VIEWS):
-        x = -0.7 + 0.2 * i
-        u = (np.arange(48) + 0.5 - 24) / 40 * 4 + x
-        v = (np.arange(32) + 0.5 - 16) / 40 * 4
-        level = 128 + 60 * np.sin(3 * u)[None] * np.cos(2 * v)[:, None]
-        cv2.imwrite(str(folder / f"{i}.png"), np.repeat(level[..., None], 3, axis=2).astype("u1"))
-        # OpenGL axes: looking along -z at the wall 4 m ahead
-        matrix = np.eye(4)
-        matrix[0, 3] = x
-        frames.append({"file_path": f"{i}.png", "transform_matrix": matrix.tolist()})
-    k = {"fl_x": 40.0, "fl_y": 40.0, "cx": 24.0, "cy": 16.0, "w": 48, "h": 32}
-    (folder / "transforms.json").write_text(json.dumps({**k, "frames": frames}))
-    return folder
+    xs_m = [-0.7 + 0.2 * i for i in range(VIEWS)]
+    return write_drive(tmp_path_factory.mktemp("wall"), xs_m)
 
 
 def verb(wall: Path, out: Path, **changes: object) -> Train:
@@ -53,7 +41,7 @@ def verb(wall: Path, out: Path, **changes: object) -> Train:
     return Train(dataset=wall, out=out, **{**settings, **changes})
 
 
-def test_it_writes_a_field_a_result_and_a_page(wall: Path, tmp_path: Path) -> None:
+def test_it_writes_a_field_a_result_and_a_page(wall, tmp_path):
     out, result, page = (tmp_path / name for name in ("a.rff", "a.json", "a.html"))
     verb(wall, out, json=str(result), report=page, limit=400).run()
     field, said = load_field(out), json.loads(result.read_text())
@@ -71,29 +59,25 @@ def test_it_writes_a_field_a_result_and_a_page(wall: Path, tmp_path: Path) -> No
     assert "dB on pictures never seen" in text
 
 
-def test_without_held_out_pictures_there_is_no_quality(wall: Path, tmp_path: Path) -> None:
+def test_without_held_out_pictures_there_is_no_quality(wall, tmp_path):
     out, result = (tmp_path / name for name in ("a.rff", "a.json"))
     verb(wall, out, json=str(result), holdout=None, iterations=5).run()
     assert json.loads(result.read_text())["held_out"] == {"psnr_db": None, "ssim": None, "views": 0}
 
 
-def test_a_page_without_held_out_pictures_is_refused_before_training(
-    wall: Path, tmp_path: Path
-) -> None:
+def test_a_page_without_held_out_pictures_is_refused_before_training(wall, tmp_path):
     with pytest.raises(InvalidInput, match="none are held out: add --holdout 8"):
         verb(wall, tmp_path / "a.rff", report=tmp_path / "a.html", holdout=None).run()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_field_too_alike_to_compress_names_the_option_that_helps(
-    wall: Path, tmp_path: Path
-) -> None:
+def test_a_field_too_alike_to_compress_names_the_option_that_helps(wall, tmp_path):
     """After one iteration all Gaussians still have one opacity."""
     with pytest.raises(InvalidInput, match=r"save it uncompressed .*train --plain"):
         verb(wall, tmp_path / "a.rff", iterations=1, gaussians=40_000, plain=False).run()
 
 
-def test_a_video_is_no_dataset_and_the_error_says_how_to_make_one(tmp_path: Path) -> None:
+def test_a_video_is_no_dataset_and_the_error_says_how_to_make_one(tmp_path):
     video = tmp_path / "phone.mp4"
     video.write_bytes(b"\0\0\0 ftypisom")
     helps = r"phone\.mp4: is a video.*rfedge dataset poses .*phone\.mp4.*camera\.toml"
@@ -103,19 +87,19 @@ def test_a_video_is_no_dataset_and_the_error_says_how_to_make_one(tmp_path: Path
         DatasetConvert(video, tmp_path / "out").run()
 
 
-def test_the_command_for_a_video_can_be_pasted_whatever_its_name(tmp_path: Path) -> None:
+def test_the_command_for_a_video_can_be_pasted_whatever_its_name(tmp_path):
     video = tmp_path / "my phone.mp4"
     video.touch()
     with pytest.raises(DatasetError, match=r"dataset poses '.*/my phone\.mp4' --out"):
         DatasetConvert(video, tmp_path / "out").run()
 
 
-def test_a_picture_is_no_dataset_and_the_error_says_what_is(wall: Path, tmp_path: Path) -> None:
+def test_a_picture_is_no_dataset_and_the_error_says_what_is(wall, tmp_path):
     with pytest.raises(DatasetError, match=r"0\.png: is no file that describes.*transforms\.json"):
         verb(wall / "0.png", tmp_path / "a.rff").run()
 
 
-def test_an_interrupted_run_ends_with_the_same_bytes(wall: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_ends_with_the_same_bytes(wall, tmp_path):
     whole, broken = tmp_path / "whole.rff", tmp_path / "broken.rff"
     settings = {"iterations": 40, "limit": 350, "checkpoint_every": 15}
     verb(wall, whole, **settings).run()
@@ -124,12 +108,12 @@ def test_an_interrupted_run_ends_with_the_same_bytes(wall: Path, tmp_path: Path)
     assert broken.read_bytes() == whole.read_bytes()
 
 
-def test_a_run_may_be_limited_by_time(wall: Path, tmp_path: Path) -> None:
+def test_a_run_may_be_limited_by_time(wall, tmp_path):
     verb(wall, tmp_path / "a.rff", minutes=0.02).run()
     assert load_field(tmp_path / "a.rff").metadata.held_out_psnr_db is not None
 
 
-def test_only_a_run_short_of_time_begins_with_halved_pictures(wall: Path, tmp_path: Path) -> None:
+def test_only_a_run_short_of_time_begins_with_halved_pictures(wall, tmp_path):
     by_time, by_count = (
         verb(wall, tmp_path / "a.rff", minutes=minutes).training_job().config
         for minutes in (1.0, None)
@@ -148,7 +132,7 @@ def still(wall: Path, tmp_path: Path) -> Path:
     return still
 
 
-def test_the_sky_of_still_pictures_is_found_and_written(still: Path, tmp_path: Path) -> None:
+def test_the_sky_of_still_pictures_is_found_and_written(still, tmp_path):
     for directions in (0, 2000):
         verb(still, tmp_path / f"{directions}.rff", iterations=1, sky=directions).run()
     without, with_sky = (load_field(tmp_path / f"{n}.rff") for n in (0, 2000))
@@ -158,7 +142,7 @@ def test_the_sky_of_still_pictures_is_found_and_written(still: Path, tmp_path: P
     assert np.abs(with_sky.bounds.high_m).max() < 100
 
 
-def test_a_start_larger_than_the_limit_is_refused(still: Path, tmp_path: Path) -> None:
+def test_a_start_larger_than_the_limit_is_refused(still, tmp_path):
     """Of the sky too, which comes beside the points and is found in the pictures."""
     too_few = r"density\.limit: 310 Gaussians are fewer than the \d+ to start with, \d+ of them sky"
     with pytest.raises(InvalidInput, match=too_few):
@@ -168,7 +152,7 @@ def test_a_start_larger_than_the_limit_is_refused(still: Path, tmp_path: Path) -
     verb(still, tmp_path / "a.rff", iterations=1, gaussians=300, limit=300).run()
 
 
-def test_a_hash_grid_is_trained_by_the_same_loop(wall: Path, tmp_path: Path) -> None:
+def test_a_hash_grid_is_trained_by_the_same_loop(wall, tmp_path):
     dataset, held_out = split_every(read_dataset(wall), 4)
     model = NgpModel(L=4, log2_T=10, N_max=64, occupancy=4000)
     config = NgpTrainingConfig(iterations=4, batch_samples=4096, model=model)
@@ -183,20 +167,19 @@ def test_a_hash_grid_is_trained_by_the_same_loop(wall: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".png"])
-def test_points_may_come_from_depth_maps(wall: Path, tmp_path: Path, suffix: str) -> None:
+def test_points_may_come_from_depth_maps(wall, tmp_path, suffix):
     for i in range(3):  # not every picture needs one
         if suffix == ".npy":
             np.save(tmp_path / f"{i}.npy", np.full((32, 48), 4.0, np.float32))
         else:
             cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((32, 48), 4000, np.uint16))
     dataset, _ = read_views(ViewChoice(wall, depths=tmp_path))
-    assert dataset.points is not None
     assert len(dataset.points.xyz_m) == 3 * 32 * 48
     # OpenCV axes of a camera that looks along -z of the world
     np.testing.assert_allclose(dataset.points.xyz_m[:, 2], -4.0, rtol=1e-6)
 
 
-def test_bad_depth_maps_are_refused_by_name(wall: Path, tmp_path: Path) -> None:
+def test_bad_depth_maps_are_refused_by_name(wall, tmp_path):
     with pytest.raises(DatasetError, match="holds no depth map"):
         read_views(ViewChoice(wall, depths=tmp_path))
     for content in (np.zeros((5, 5), np.float32), np.zeros((32, 48, 3), np.float32)):
@@ -216,16 +199,14 @@ def test_bad_depth_maps_are_refused_by_name(wall: Path, tmp_path: Path) -> None:
         (None, r"0\.png: not a readable depth map"),
     ],
 )
-def test_a_picture_that_holds_no_depths_is_refused(
-    wall: Path, tmp_path: Path, pixels: np.ndarray | None, problem: str
-) -> None:
+def test_a_picture_that_holds_no_depths_is_refused(wall, tmp_path, pixels, problem):
     data = b"nonsense" if pixels is None else cv2.imencode(".png", pixels)[1].tobytes()
     (tmp_path / "0.png").write_bytes(data)
     with pytest.raises(DatasetError, match=problem):
         read_views(ViewChoice(wall, depths=tmp_path))
 
 
-def test_a_depth_map_is_read_in_millimetres(tmp_path: Path) -> None:
+def test_a_depth_map_is_read_in_millimetres(tmp_path):
     stored = np.random.default_rng(3).integers(0, 65536, (7, 9), dtype=np.uint16)
     cv2.imwrite(str(tmp_path / "0.png"), stored)
     np.testing.assert_array_equal(
@@ -233,7 +214,7 @@ def test_a_depth_map_is_read_in_millimetres(tmp_path: Path) -> None:
     )
 
 
-def test_declared_exposure_is_learned_and_nothing_else_is(wall: Path, tmp_path: Path) -> None:
+def test_declared_exposure_is_learned_and_nothing_else_is(wall, tmp_path):
     content = json.loads((wall / "transforms.json").read_text())
     results = {}
     for exposure in ("auto", "fixed"):
@@ -258,12 +239,12 @@ def test_declared_exposure_is_learned_and_nothing_else_is(wall: Path, tmp_path: 
         ({"size": "24x0"}, "size"),
     ],
 )
-def test_what_makes_no_sense_is_refused_by_name(wall, tmp_path, change, named) -> None:
+def test_what_makes_no_sense_is_refused_by_name(wall, tmp_path, change, named):
     with pytest.raises(InvalidInput, match=named):
         verb(wall, **{"out": tmp_path / "a.rff", **change}).run()
 
 
-def test_a_share_of_the_views_is_spread_evenly() -> None:
+def test_a_share_of_the_views_is_spread_evenly():
     views = tuple(range(120))
     assert share_of_views(views, 25) == tuple(range(0, 120, 4))
     assert share_of_views(views, 50) == tuple(range(0, 120, 2))

@@ -53,7 +53,7 @@ class Scripted(FieldTrainer):
         return Parameters(np.ones(2), np.full(2, 5.0))
 
 
-def test_progress_is_the_share_of_iterations_done_before_each() -> None:
+def test_progress_is_the_share_of_iterations_done_before_each():
     trainer = Scripted([0.4, 0.3, 0.2, 0.1])
     told = list(trainer.steps())
     assert trainer.descended == [0.0, 0.25, 0.5, 0.75]
@@ -66,20 +66,14 @@ def test_progress_is_the_share_of_iterations_done_before_each() -> None:
     assert trainer.finished
 
 
-def test_a_run_limited_by_time_passes_its_own_progress() -> None:
+def test_a_run_limited_by_time_passes_its_own_progress():
     trainer = Scripted([0.4, 0.3])
     trainer.step(0.9)
     assert trainer.descended == [0.9]
     assert trainer.after == [(1, 0.9)]
 
 
-def test_density_control_comes_after_the_iteration_is_counted() -> None:
-    trainer = Scripted([0.4, 0.3])
-    list(trainer.steps())
-    assert trainer.after == [(1, 0.0), (2, 0.5)]
-
-
-def test_a_finished_run_does_no_further_iteration() -> None:
+def test_a_finished_run_does_no_further_iteration():
     trainer = Scripted([0.4])
     trainer.step()
     with pytest.raises(InvalidInput, match="all 1 iterations are done"):
@@ -87,14 +81,14 @@ def test_a_finished_run_does_no_further_iteration() -> None:
     assert trainer.iteration == len(trainer.descended) == 1
 
 
-def test_a_loss_that_is_no_number_ends_the_run_with_its_iteration() -> None:
+def test_a_loss_that_is_no_number_ends_the_run_with_its_iteration():
     trainer = Scripted([0.4, float("nan"), 0.1])
     with pytest.raises(TrainingDiverged, match="the loss is nan") as caught:
         list(trainer.steps())
     assert caught.value.iteration == trainer.iteration == 2
 
 
-def test_a_restored_run_does_only_what_is_left() -> None:
+def test_a_restored_run_does_only_what_is_left():
     done, rest = Scripted([0.4, 0.3, 0.2]), Scripted([0.4, 0.3, 0.2])
     done.step()
     done.step()
@@ -102,7 +96,7 @@ def test_a_restored_run_does_only_what_is_left() -> None:
     assert [step.loss for step in rest.steps()] == [0.2]
 
 
-def test_metadata_states_the_run_and_what_was_measured() -> None:
+def test_metadata_states_the_run_and_what_was_measured():
     trainer = Scripted([0.4])
     origin = TileOrigin(1.0, 2.0, 3.0)
     assert trainer.field("street", origin, HeldOut(27.0, 0.8)) == FieldMetadata(
@@ -112,9 +106,7 @@ def test_metadata_states_the_run_and_what_was_measured() -> None:
 
 
 @pytest.mark.parametrize("config", [SplatTrainingConfig(), NgpTrainingConfig()])
-def test_threads_and_instruction_set_are_no_settings_of_the_result(
-    config: SplatTrainingConfig | NgpTrainingConfig,
-) -> None:
+def test_threads_and_instruction_set_are_no_settings_of_the_result(config):
     elsewhere = replace(config, threads=7, isa="scalar")
     assert settings_of(elsewhere) == settings_of(config)
     assert settings_of(replace(config, iterations=17)) != settings_of(config)

@@ -1,7 +1,7 @@
 """The loop around a trainer: time-limited runs, measurements, checkpoints, whatever is trained."""
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -62,14 +62,14 @@ def statuses(loop: TrainingLoop) -> list[LoopStatus]:
     return told
 
 
-def test_a_run_limited_by_iterations_leaves_progress_to_the_trainer() -> None:
+def test_a_run_limited_by_iterations_leaves_progress_to_the_trainer():
     steps = Steps(10)
     told = statuses(loop_of(steps, LoopLimits()))
     assert steps.progress == [None] * 10
     assert [status.progress for status in told] == pytest.approx([i / 10 for i in range(1, 11)])
 
 
-def test_a_run_limited_by_time_ends_by_the_clock_and_tells_the_trainer_how_far_it_is() -> None:
+def test_a_run_limited_by_time_ends_by_the_clock_and_tells_the_trainer_how_far_it_is():
     steps = Steps(1_000_000)
     loop = loop_of(steps, LoopLimits(minutes=1.0))
     statuses(loop)
@@ -78,7 +78,7 @@ def test_a_run_limited_by_time_ends_by_the_clock_and_tells_the_trainer_how_far_i
     assert loop.seconds == pytest.approx(60.0)
 
 
-def test_measuring_takes_no_training_time() -> None:
+def test_measuring_takes_no_training_time():
     steps = Steps(1_000_000)
     loop = loop_of(steps, LoopLimits(minutes=1.0, measurements=5), measuring_s=500.0)
     statuses(loop)
@@ -86,7 +86,7 @@ def test_measuring_takes_no_training_time() -> None:
     assert [s for s, _ in loop.curve] == pytest.approx([12, 24, 36, 48, 60])
 
 
-def test_the_curve_has_so_many_points_and_ends_at_the_end() -> None:
+def test_the_curve_has_so_many_points_and_ends_at_the_end():
     steps = Steps(24)
     loop = loop_of(steps, LoopLimits(measurements=4))
     told = statuses(loop)
@@ -95,7 +95,7 @@ def test_the_curve_has_so_many_points_and_ends_at_the_end() -> None:
     assert told[-1].psnr_db == 44.0
 
 
-def test_without_measurements_there_is_no_curve() -> None:
+def test_without_measurements_there_is_no_curve():
     loop = loop_of(Steps(5), LoopLimits(measurements=0), measuring_s=9.0)
     assert all(status.psnr_db is None for status in statuses(loop))
     assert (loop.curve, loop.seconds) == ([], 10.0)
@@ -107,7 +107,7 @@ def checkpoint_path(tmp_path: Path) -> Iterator[Path]:
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_resumed_run_goes_on_counting_seconds_and_its_curve(checkpoint_path: Path) -> None:
+def test_a_resumed_run_goes_on_counting_seconds_and_its_curve(checkpoint_path):
     limits = LoopLimits(checkpoint=checkpoint_path, checkpoint_every=4, measurements=4)
     broken = Steps(12, fails_at=11)
     with pytest.raises(TrainingDiverged):
@@ -120,7 +120,7 @@ def test_a_resumed_run_goes_on_counting_seconds_and_its_curve(checkpoint_path: P
     assert [s for s, _ in resumed.curve] == pytest.approx([6.0, 12.0, 18.0, 24.0])
 
 
-def test_the_last_good_checkpoint_survives_a_run_that_diverges(checkpoint_path: Path) -> None:
+def test_the_last_good_checkpoint_survives_a_run_that_diverges(checkpoint_path):
     limits = LoopLimits(checkpoint=checkpoint_path, checkpoint_every=3)
     with pytest.raises(TrainingDiverged, match="iteration 7, means"):
         statuses(loop_of(Steps(12, fails_at=7), limits))
@@ -129,7 +129,7 @@ def test_the_last_good_checkpoint_survives_a_run_that_diverges(checkpoint_path: 
     assert loop.trainer.iteration == 6
 
 
-def test_resuming_needs_a_checkpoint() -> None:
+def test_resuming_needs_a_checkpoint():
     with pytest.raises(InvalidInput, match="resume"):
         loop_of(Steps(3), LoopLimits()).resume()
 
@@ -143,12 +143,12 @@ def test_resuming_needs_a_checkpoint() -> None:
         ({"measurements": -1}, "measurements"),
     ],
 )
-def test_limits_that_make_no_sense_are_refused(change: Mapping[str, Any], named: str) -> None:
+def test_limits_that_make_no_sense_are_refused(change, named):
     with pytest.raises(InvalidInput, match=named):
         LoopLimits(**change)
 
 
-def test_a_log_gets_a_line_at_each_twentieth_with_the_time_left() -> None:
+def test_a_log_gets_a_line_at_each_twentieth_with_the_time_left():
     steps, log = Steps(200), io.StringIO()
     run_showing(loop_of(steps, LoopLimits()), Console(file=log, width=200), lambda: steps.now_s)
     lines = log.getvalue().splitlines()
@@ -157,7 +157,7 @@ def test_a_log_gets_a_line_at_each_twentieth_with_the_time_left() -> None:
     assert lines[9].endswith(", 3 min left")  # 100 steps of 2 s
 
 
-def test_what_showing_the_field_takes_is_no_time_of_training() -> None:
+def test_what_showing_the_field_takes_is_no_time_of_training():
     steps, shown = Steps(5), []
 
     def show(trainer: Any) -> None:

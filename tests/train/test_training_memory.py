@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -13,14 +12,14 @@ SIZE_PX = (320, 184)
 GAUSSIANS = 60_000
 
 
-def test_a_run_that_does_not_fit_is_refused_with_both_figures() -> None:
+def test_a_run_that_does_not_fit_is_refused_with_both_figures():
     with pytest.raises(InvalidInput, match=r"3\.0 GiB of memory and 2\.0 GiB are available"):
         check_memory(3 << 30, 2 << 30)
     check_memory(2 << 30, 2 << 30)
     check_memory(2 << 30, None)
 
 
-def test_available_memory_is_what_the_system_says(tmp_path: Path) -> None:
+def test_available_memory_is_what_the_system_says(tmp_path):
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemTotal: 9 kB\nMemAvailable:    2048 kB\n")
     assert available_bytes(meminfo) == 2 << 20
@@ -29,7 +28,7 @@ def test_available_memory_is_what_the_system_says(tmp_path: Path) -> None:
     assert available_bytes(meminfo) is None
 
 
-def test_more_of_anything_takes_more() -> None:
+def test_more_of_anything_takes_more():
     one = splat_training_bytes(1000, 2, [SIZE_PX])
     assert splat_training_bytes(2000, 2, [SIZE_PX]) > one
     assert splat_training_bytes(1000, 3, [SIZE_PX]) > one
@@ -60,7 +59,7 @@ print(peak() - before)
 """
 
 
-def test_the_estimate_is_near_the_peak_of_a_real_run() -> None:
+def test_the_estimate_is_near_the_peak_of_a_real_run():
     done = subprocess.run(
         [sys.executable, "-c", RUN], capture_output=True, text=True, check=True, timeout=60
     )

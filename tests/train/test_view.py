@@ -3,7 +3,6 @@
 import json
 import socket
 import struct
-from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -31,26 +30,25 @@ class Wall:
 
 
 @pytest.mark.parametrize("slow_s", [0.01, 0.4, 5.0])
-def test_snapshots_take_no_more_than_their_share(slow_s: float, tmp_path: Path) -> None:
+def test_snapshots_take_no_more_than_their_share(slow_s, tmp_path):
     wall = Wall(slow_s)
     snapshots = Snapshots(tmp_path / "field.rff", lambda: wall.now_s)
     for _ in range(5000):
         wall.now_s += 0.2  # an iteration
-        snapshots(wall)  # type: ignore[arg-type]
+        snapshots(wall)
     assert snapshots.count >= 2
     assert snapshots.count * slow_s <= SHARE * (wall.now_s - 100.0) + slow_s
 
 
-def test_a_followed_file_is_read_each_time_that_it_is_written(tmp_path: Path) -> None:
+def test_a_followed_file_is_read_each_time_that_it_is_written(tmp_path):
     wall, path = Wall(), tmp_path / "field.rff"
     followed = FollowedFile(path)
     assert followed.newer() is None, "not yet written"
     snapshots = Snapshots(path, lambda: wall.now_s)
     ids = []
     for _ in range(2):
-        snapshots(wall)  # type: ignore[arg-type]
+        snapshots(wall)
         newer = followed.newer()
-        assert newer is not None
         ids.append(newer.field_id)
         assert followed.newer() is None, "the same file"
         wall.now_s += 60.0
@@ -58,11 +56,11 @@ def test_a_followed_file_is_read_each_time_that_it_is_written(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-async def test_the_page_shows_what_was_written_and_goes_with_the_training() -> None:
+async def test_the_page_shows_what_was_written_and_goes_with_the_training():
     wall, told = Wall(), list[str]()
     settings = WebSettings(Address("127.0.0.1", 0))
     with shown_in_browser(settings, None, told.append) as snapshots:
-        snapshots(wall)  # type: ignore[arg-type]
+        snapshots(wall)
         assert await first_field(told[0]) == wall_field(wall.level).primitives
     async with aiohttp.ClientSession() as session:
         with pytest.raises(aiohttp.ClientConnectionError):
@@ -84,7 +82,7 @@ async def first_field(url: str) -> int:
 
 
 @pytest.mark.slow
-def test_a_page_that_cannot_be_served_says_why() -> None:
+def test_a_page_that_cannot_be_served_says_why():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         settings = WebSettings(Address("127.0.0.1", taken.getsockname()[1]))
         with (

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mec_server.tile_history import LEARNING, Learnt, TileHistory, write_histories
 from mec_server.tile_learning import LearningJob, LearningRounds
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
@@ -21,7 +22,14 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.update.passes import Pass
 from rfcore.update.run import LearnAs, Update, UpdateSettings, learn
 from rfcore.views import PosedPicture
-from rfcore.wire.tile_manifest import Ground, TileVersions, publish, read_publication
+from rfcore.wire.tile_manifest import (
+    Ground,
+    TileVersions,
+    VersionLabel,
+    publish,
+    read_publication,
+)
+from tests.clouds import upright
 
 K = Intrinsics(96, 64, 70.0, 70.0, 48.0, 32.0)
 Paint = Callable[[int, Rgb], Rgb]
@@ -30,18 +38,11 @@ MakePass = Callable[..., Pass]
 
 def wall() -> Gaussians:
     """900 flat splats at a depth of 4 m, textured."""
-    rng = np.random.default_rng(0)
     x, y = np.meshgrid(np.linspace(-4, 4, 36), np.linspace(-2.5, 2.5, 25))
     means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 4.0)], axis=1)
-    n = len(means)
-    colours = 0.5 + 0.3 * rng.uniform(-1, 1, (n, 3))
-    return Gaussians(
-        means=means.astype(np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        log_scales=np.tile(np.log(np.float32([0.13, 0.13, 0.02])), (n, 1)),
-        opacity_logits=np.full(n, 3.0, np.float32),
-        sh=((colours - 0.5) / SH_DC).astype(np.float32)[:, None],
-    )
+    colours = 0.5 + 0.3 * np.random.default_rng(0).uniform(-1, 1, (x.size, 3))
+    size_m = np.float32([0.13, 0.13, 0.02])
+    return upright(means, (colours - 0.5) / SH_DC, size_m, 3.0).gaussians
 
 
 def darkened(gaussians: Gaussians) -> Gaussians:
@@ -81,6 +82,17 @@ def make_pass() -> MakePass:
     return make
 
 
+def pasted(number: int, _: Rgb) -> Rgb:
+    """A picture of another place."""
+    rng = np.random.default_rng(number)
+    return np.kron(rng.integers(0, 255, (8, 12, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+
+
+def sometimes(number: int, rgb: Rgb) -> Rgb:
+    """Two frames of a pass show another place."""
+    return pasted(100 + number, rgb) if number in (3, 7) else rgb
+
+
 NOW_MS = 1_767_290_400_000
 """18:00 UTC."""
 NOW = datetime.fromtimestamp(NOW_MS / 1e3, UTC)
@@ -113,6 +125,16 @@ class Street:
             lines.append(line.line())
         (part / RECORDING_NAME).write_text("".join(lines))
         os.utime(part / RECORDING_NAME, (NOW_MS / 1e3 - 60, NOW_MS / 1e3 - 60))
+
+    def publish_harm(self, field: SplatField) -> str:
+        """Publish a field as a light that the process has learnt; return its id."""
+        path = self.fields.parent / "bad.rff"
+        bad_id = save_field(field, path)
+        (self.recordings / LEARNING).mkdir(exist_ok=True)
+        learnt = Learnt(bad_id, "h17", self.noon_id, 2, 20.0, NOW_MS)
+        write_histories(self.recordings, {"west": TileHistory((learnt,))})
+        publish(self.fields, "west", path, Ground(), NOW, VersionLabel("h17", "", 2, 17.0))
+        return bad_id
 
     def rounds(self, **changes: Any) -> LearningRounds:
         return LearningRounds(replace(self.job, **changes), lambda: NOW_MS)

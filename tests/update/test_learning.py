@@ -1,6 +1,5 @@
 """What is learnt of another light and of change, and what is not written."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,8 +17,8 @@ from rfcore.update.colours import ColourFit, colour_layer
 from rfcore.update.passes import Pass, split_frames, trusted_pixels
 from rfcore.update.run import LearnAs, Trial, UpdateSettings, learn, saved_percent, try_field
 from rfcore.update.splats import FineTuning, fine_tuned
+from tests.clouds import upright
 
-MakePass = Callable[..., Pass]
 QUICK = UpdateSettings(fine_tuning=FineTuning(120, growth=0.0))
 
 
@@ -36,9 +35,7 @@ def luma_error(field: SplatField, drive: Pass) -> float:
     return float(np.mean([np.abs(colour - p.read()).mean() for colour, p in pairs]))
 
 
-def test_another_light_is_learnt_and_pays(
-    noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+def test_another_light_is_learnt_and_pays(noon, dusk, make_pass):
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
     update = learn(noon, passes, QUICK)
     assert not update.refused
@@ -47,9 +44,7 @@ def test_another_light_is_learnt_and_pays(
     assert luma_error(update.learnt, third) < 0.2 * luma_error(noon, third)
 
 
-def test_a_layer_learns_the_light_on_the_shape_that_is_there(
-    noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+def test_a_layer_learns_the_light_on_the_shape_that_is_there(noon, dusk, make_pass):
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
     update = learn(noon, passes, replace(QUICK, learn_as=LearnAs.COLOURS))
     assert not update.refused
@@ -57,13 +52,11 @@ def test_a_layer_learns_the_light_on_the_shape_that_is_there(
     assert luma_error(update.learnt, third) < 0.3 * luma_error(noon, third)
     data = encode_field(update.learnt)
     again = decode_field(data, open_base=lambda _: noon)
-    assert (again.gaussians.sh == update.learnt.gaussians.sh).all()  # type: ignore[attr-defined]
-    assert (again.gaussians.means == noon.gaussians.means).all()  # type: ignore[attr-defined]
+    assert (again.gaussians.sh == update.learnt.gaussians.sh).all()
+    assert (again.gaussians.means == noon.gaussians.means).all()
 
 
-def test_a_delta_learns_as_much_in_fewer_bytes_and_again_from_what_it_learnt(
-    noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+def test_a_delta_learns_as_much_in_fewer_bytes_and_again_from_what_it_learnt(noon, dusk, make_pass):
     """A second update starts from the first one's field, and is a delta of the same base."""
     base = noon.compressed()
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
@@ -83,29 +76,25 @@ def test_a_delta_learns_as_much_in_fewer_bytes_and_again_from_what_it_learnt(
 
 
 def test_a_delta_of_a_field_that_is_not_compressed_is_refused_before_learning(
-    noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+    noon, dusk, make_pass
+):
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
     with pytest.raises(InvalidInput, match=r"delta\.base: .* is not a compressed field"):
         learn(noon, passes, replace(QUICK, learn_as=LearnAs.DELTA))
 
 
-def test_what_is_known_already_is_not_written(noon: SplatField, make_pass: MakePass) -> None:
+def test_what_is_known_already_is_not_written(noon, make_pass):
     update = learn(noon, [make_pass(noon, "a"), make_pass(noon, "b", 0.1)], QUICK)
     assert "less than 2 %" in update.refused or "rise by" in update.refused
 
 
-def test_a_pass_that_gets_dearer_withholds_the_update(
-    noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+def test_a_pass_that_gets_dearer_withholds_the_update(noon, dusk, make_pass):
     """Two at dusk outvote one at noon, whose bits would rise."""
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.1), make_pass(noon, "c", 0.05)]
     assert learn(noon, passes, QUICK).refused.startswith("bits rise by")
 
 
-def test_the_same_passes_give_the_same_field(
-    noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+def test_the_same_passes_give_the_same_field(noon, dusk, make_pass):
     frames, _ = split_frames([make_pass(dusk, "a"), make_pass(dusk, "b", 0.1)], 24)
     config = FineTuning(30)
     first = fine_tuned(noon, frames, config)
@@ -116,18 +105,17 @@ def test_the_same_passes_give_the_same_field(
     assert layers[0].field_id == layers[1].field_id
 
 
-def test_what_drives_by_in_one_pass_is_not_trusted(noon: SplatField, make_pass: MakePass) -> None:
+def test_what_drives_by_in_one_pass_is_not_trusted(noon, make_pass):
     passes = [make_pass(noon, "a", paint=with_vehicle), make_pass(noon, "b", 0.03)]
     frames, _ = split_frames(passes, 24)
     trusted = trusted_pixels(noon, frames)
     first = trusted[0]
-    assert first is not None
     assert not first[28:44, 16:24].any()
     assert first[:, 72:].all()
     assert all(mask is None for mask in trusted[len(frames) // 2 :])
 
 
-def test_what_all_passes_see_is_trusted(noon: SplatField, make_pass: MakePass) -> None:
+def test_what_all_passes_see_is_trusted(noon, make_pass):
     def parked(_: int, rgb: Rgb) -> Rgb:
         return with_vehicle(5, rgb)
 
@@ -137,9 +125,7 @@ def test_what_all_passes_see_is_trusted(noon: SplatField, make_pass: MakePass) -
     assert all(mask is None or mask[28:44, 32:44].all() for mask in masks)
 
 
-def test_a_vehicle_in_one_of_two_passes_is_not_baked_in(
-    noon: SplatField, make_pass: MakePass
-) -> None:
+def test_a_vehicle_in_one_of_two_passes_is_not_baked_in(noon, make_pass):
     """A wall in white before the first vehicle; against the same update without votes."""
 
     def walled(_: int, rgb: Rgb) -> Rgb:
@@ -156,7 +142,7 @@ def test_a_vehicle_in_one_of_two_passes_is_not_baked_in(
     assert voted < 0.5 * luma_error(fine_tuned(noon, believed, config), empty)
 
 
-def test_bits_are_compared_at_equal_quality() -> None:
+def test_bits_are_compared_at_equal_quality():
     """Two lines of equal slope in log(rate), a factor of two apart."""
     before = Trial({0: ((30.0, 100.0), (33.0, 200.0), (36.0, 400.0))})
     after = Trial({0: ((31.0, 100 * 2 ** (1 / 3) / 2), (37.0, 100 * 2 ** (7 / 3) / 2))})
@@ -164,7 +150,7 @@ def test_bits_are_compared_at_equal_quality() -> None:
     assert saved_percent(after, before)[0] == pytest.approx(-100.0)
 
 
-def test_a_trial_without_frames_is_refused(noon: SplatField) -> None:
+def test_a_trial_without_frames_is_refused(noon):
     with pytest.raises(InvalidInput, match="no frames are held back"):
         try_field(noon, [])
 
@@ -176,16 +162,10 @@ def with_box(field: SplatField) -> SplatField:
     """A white box of 80 splats, 0.8 by 0.6 m, half a metre before the wall."""
     rng = np.random.default_rng(3)
     x, y = np.meshgrid(np.linspace(-0.4, 0.4, 10), np.linspace(-0.3, 0.3, 8))
-    n = x.size
-    means = np.stack([x.ravel(), y.ravel(), np.full(n, BOX_M)], axis=1)
-    colours = 0.9 + 0.1 * rng.uniform(-1, 1, (n, 3))
-    box = Gaussians(
-        means=means.astype(np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        log_scales=np.tile(np.log(np.float32([0.06, 0.06, 0.02])), (n, 1)),
-        opacity_logits=np.full(n, 3.0, np.float32),
-        sh=((colours - 0.5) / SH_DC).astype(np.float32)[:, None],
-    )
+    means = np.stack([x.ravel(), y.ravel(), np.full(x.size, BOX_M)], axis=1)
+    colours = 0.9 + 0.1 * rng.uniform(-1, 1, (x.size, 3))
+    size_m = np.float32([0.06, 0.06, 0.02])
+    box = upright(means, (colours - 0.5) / SH_DC, size_m, 3.0).gaussians
     parts = (field.gaussians, box)
     names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
@@ -202,9 +182,7 @@ def where_the_box_is(gaussians: Gaussians) -> NDArray[np.bool_]:
     return (np.abs(x / z * BOX_M) < 0.5) & (np.abs(y / z * BOX_M) < 0.4)
 
 
-def test_gaussians_are_added_where_something_has_come_to_stay(
-    noon: SplatField, make_pass: MakePass
-) -> None:
+def test_gaussians_are_added_where_something_has_come_to_stay(noon, make_pass):
     """The share of new ones there is several times that of the rest of the wall."""
     parked = with_box(noon)
     frames, _ = split_frames([make_pass(parked, "a"), make_pass(parked, "b", 0.15)], 24)

@@ -1,6 +1,5 @@
 """A tile that is learnt about again: lasting change, a light twice, room for new archives."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,9 +9,6 @@ from structlog.testing import capture_logs
 
 from mec_server.tile_history import read_histories
 from rfcore.field import SplatField
-from rfcore.update.passes import Pass
-
-MakePass = Callable[..., Pass]
 
 
 def with_poster(field: SplatField, left_m: float) -> SplatField:
@@ -29,9 +25,7 @@ def bytes_of(street: Any, field_id: str) -> int:
     return size
 
 
-def test_what_changed_for_good_becomes_the_tiles_own_field(
-    street: Any, noon: SplatField, make_pass: MakePass
-) -> None:
+def test_what_changed_for_good_becomes_the_tiles_own_field(street, noon, make_pass):
     changed = with_poster(noon, -0.7)
     street.record(make_pass(changed, "a"))
     street.record(make_pass(changed, "b", 0.15))
@@ -47,9 +41,7 @@ def test_what_changed_for_good_becomes_the_tiles_own_field(
 
 
 @pytest.mark.usefixtures("learnt_before")
-def test_passes_that_teach_nothing_new_of_a_light_publish_nothing(
-    at_dusk: Any, dusk: SplatField, make_pass: MakePass
-) -> None:
+def test_passes_that_teach_nothing_new_of_a_light_publish_nothing(at_dusk, dusk, make_pass):
     at_dusk.rounds().run()
     west = at_dusk.west()
     (light,) = west.tile("west").lights
@@ -65,8 +57,8 @@ def test_passes_that_teach_nothing_new_of_a_light_publish_nothing(
 
 @pytest.mark.usefixtures("learnt_before")
 def test_a_light_is_learnt_again_where_the_street_has_changed_and_its_old_archive_makes_room(
-    at_dusk: Any, dusk: SplatField, make_pass: MakePass, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    at_dusk, dusk, make_pass, monkeypatch
+):
     """Three times: the first archive is deleted for the third, since only two fit."""
     at_dusk.rounds().run()
     monkeypatch.undo()  # learn for real from here on

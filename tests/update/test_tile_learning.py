@@ -3,9 +3,7 @@
 import errno
 import os
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -16,20 +14,17 @@ from structlog.testing import capture_logs
 
 from mec_server.learner import RESTART_S, Learner
 from mec_server.metrics import ServerMetrics
-from mec_server.tile_history import LEARNING, Learnt, TileHistory, read_histories, write_histories
+from mec_server.tile_history import LEARNING, Learnt, TileHistory, read_histories
 from mec_server.tile_learning import WATCH_EVERY_MS, LearningRounds
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldStore, SplatField, save_field
-from rfcore.image import Rgb
 from rfcore.update.passes import Pass, without_outliers
 from rfcore.update.run import Update, UpdateSettings, learn_from
 from rfcore.update.splats import Progress
 from rfcore.wire.settings import LogForm
 from rfcore.wire.tile_manifest import MANIFEST, Ground, VersionLabel, publish
 from rfcore.wire.tiles import Tile, TileLight
-from tests.update.conftest import NOW, NOW_MS
-
-MakePass = Callable[..., Pass]
+from tests.update.conftest import NOW, NOW_MS, pasted, sometimes
 
 
 def elsewhere(drive: Pass) -> Pass:
@@ -45,12 +40,7 @@ def elsewhere(drive: Pass) -> Pass:
     return Pass(drive.identity, tuple(moved(number) for number in range(len(drive.pictures))))
 
 
-def pasted(number: int, _: Rgb) -> Rgb:
-    rng = np.random.default_rng(number)
-    return np.kron(rng.integers(0, 255, (8, 12, 3)), np.ones((8, 8, 1))).astype(np.uint8)
-
-
-def test_two_vehicles_teach_a_light_once(at_dusk: Any) -> None:
+def test_two_vehicles_teach_a_light_once(at_dusk):
     rounds = at_dusk.rounds()
     rounds.run()
     west = at_dusk.west()
@@ -65,9 +55,7 @@ def test_two_vehicles_teach_a_light_once(at_dusk: Any) -> None:
     assert at_dusk.west() == west
 
 
-def test_fewer_vehicles_than_asked_for_teach_nothing(
-    street: Any, dusk: SplatField, make_pass: MakePass
-) -> None:
+def test_fewer_vehicles_than_asked_for_teach_nothing(street, dusk, make_pass):
     for shift_m in (0.0, 0.15, 0.3):
         street.record(make_pass(dusk, "a", shift_m))
     street.rounds().run()
@@ -77,9 +65,7 @@ def test_fewer_vehicles_than_asked_for_teach_nothing(
 
 @pytest.mark.usefixtures("learnt_before")
 @pytest.mark.parametrize("poison", ["poses", "pictures"])
-def test_poisoned_passes_are_dropped_and_make_no_identity(
-    street: Any, dusk: SplatField, make_pass: MakePass, poison: str
-) -> None:
+def test_poisoned_passes_are_dropped_and_make_no_identity(street, dusk, make_pass, poison):
     """With one honest vehicle nothing is learnt; with two, what the two saw."""
     street.record(make_pass(dusk, "a"))
     if poison == "poses":
@@ -97,19 +83,14 @@ def test_poisoned_passes_are_dropped_and_make_no_identity(
     assert learnt.identities == 2
 
 
-def test_single_frames_that_nobody_confirms_are_dropped(
-    noon: SplatField, make_pass: MakePass
-) -> None:
-    def sometimes(number: int, rgb: Rgb) -> Rgb:
-        return pasted(number, rgb) if number in (3, 7) else rgb
-
+def test_single_frames_that_nobody_confirms_are_dropped(noon, make_pass):
     drives = [make_pass(noon, "a", paint=sometimes), make_pass(noon, "b", 0.05)]
     kept = without_outliers(noon, drives)
     assert [len(drive.pictures) for drive in kept] == [10, 12]
     assert {p.name for p in kept[0].pictures}.isdisjoint({"3.png", "7.png"})
 
 
-def test_what_another_vehicle_saw_too_is_no_outlier(noon: SplatField, make_pass: MakePass) -> None:
+def test_what_another_vehicle_saw_too_is_no_outlier(noon, make_pass):
     """A new front on the wall, nothing like the field, seen by two; then by one alone."""
     front = pasted(0, np.zeros((64, 96, 3), np.uint8))
     drives = [make_pass(noon, name, paint=lambda _, __: front) for name in "ab"]
@@ -118,15 +99,10 @@ def test_what_another_vehicle_saw_too_is_no_outlier(noon: SplatField, make_pass:
 
 
 def test_an_update_that_makes_bits_worse_is_withdrawn_within_50_frames(
-    street: Any, noon: SplatField, dusk: SplatField, make_pass: MakePass, tmp_path: Path
-) -> None:
+    street, noon, dusk, make_pass
+):
     street.rounds().run()
-    bad_id = save_field(dusk, tmp_path / "bad.rff")
-    published = Learnt(bad_id, "h17", street.noon_id, 2, 20.0, NOW_MS)
-    write_histories(street.recordings, {"west": TileHistory((published,))})
-    label = VersionLabel("h17", "", 2, 17.0)
-    publish(street.fields, "west", tmp_path / "bad.rff", Ground(), NOW, label)
-    street.record(make_pass(noon, "c"), bad_id, times=4)
+    street.record(make_pass(noon, "c"), street.publish_harm(dusk), times=4)
     with capture_logs() as lines:
         street.rounds().run()
     assert [line["event"] for line in lines] == ["update withdrawn"]
@@ -138,27 +114,9 @@ def test_an_update_that_makes_bits_worse_is_withdrawn_within_50_frames(
     assert read_histories(street.recordings)["west"] == history
 
 
-def published_harm(street: Any, dusk: SplatField, folder: Path) -> str:
-    """Publish dusk as a light that the process has learnt; return the field's id."""
-    bad_id = save_field(dusk, folder / "bad.rff")
-    published = Learnt(bad_id, "h17", street.noon_id, 2, 20.0, NOW_MS)
-    (street.recordings / LEARNING).mkdir(exist_ok=True)
-    write_histories(street.recordings, {"west": TileHistory((published,))})
-    label = VersionLabel("h17", "", 2, 17.0)
-    publish(street.fields, "west", folder / "bad.rff", Ground(), NOW, label)
-    return bad_id
-
-
-def test_a_harm_is_seen_while_another_update_is_tried(
-    at_dusk: Any,
-    noon: SplatField,
-    dusk: SplatField,
-    make_pass: MakePass,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_harm_is_seen_while_another_update_is_tried(at_dusk, noon, dusk, make_pass, monkeypatch):
     """A vehicle meets the bad field when the trial of the next one has begun."""
-    bad_id = published_harm(at_dusk, dusk, tmp_path)
+    bad_id = at_dusk.publish_harm(dusk)
     now_ms, done = [NOW_MS], []
 
     def learn_and_tell(
@@ -180,11 +138,8 @@ def test_a_harm_is_seen_while_another_update_is_tried(
     assert done[-1] == ("trial", 0), "it was withdrawn before the trial was over"
 
 
-def test_a_process_withdraws_within_50_frames_what_makes_bits_worse(
-    street: Any, noon: SplatField, dusk: SplatField, make_pass: MakePass, tmp_path: Path
-) -> None:
-    bad_id = published_harm(street, dusk, tmp_path)
-    street.record(make_pass(noon, "c"), bad_id, times=4)
+def test_a_process_withdraws_within_50_frames_what_makes_bits_worse(street, noon, dusk, make_pass):
+    street.record(make_pass(noon, "c"), street.publish_harm(dusk), times=4)
     (file,) = street.recordings.glob("c/front/*/recording.jsonl")
     os.utime(file)
     assert len(file.read_text().splitlines()) - 1 <= 50
@@ -201,7 +156,7 @@ def test_a_process_withdraws_within_50_frames_what_makes_bits_worse(
 
 
 @pytest.mark.usefixtures("learnt_before")
-def test_an_update_that_helps_stays(at_dusk: Any, dusk: SplatField, make_pass: MakePass) -> None:
+def test_an_update_that_helps_stays(at_dusk, dusk, make_pass):
     at_dusk.rounds().run()
     west = at_dusk.west()
     at_dusk.record(make_pass(dusk, "c", 0.05), west.tile("west").lights[0].field_id, times=4)
@@ -217,8 +172,8 @@ class Killed(BaseException):
 @pytest.mark.usefixtures("learnt_before")
 @pytest.mark.parametrize("step", ["learn_from", "save_field", "publish", "store", "manifest"])
 def test_a_killed_round_publishes_nothing_half_and_the_next_does_the_work(
-    at_dusk: Any, monkeypatch: pytest.MonkeyPatch, step: str
-) -> None:
+    at_dusk, monkeypatch, step
+):
     target = {
         "store": "rfcore.wire.tile_manifest.FieldStore.add",
         "manifest": "rfcore.wire.tile_manifest.write_publication",
@@ -239,9 +194,7 @@ def test_a_killed_round_publishes_nothing_half_and_the_next_does_the_work(
 
 
 @pytest.mark.usefixtures("learnt_before")
-def test_a_full_disk_publishes_nothing_and_is_reported(
-    at_dusk: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_publishes_nothing_and_is_reported(at_dusk, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -254,27 +207,21 @@ def test_a_full_disk_publishes_nothing_and_is_reported(
 
 
 @pytest.mark.usefixtures("learnt_before")
-def test_learnt_fields_stay_within_their_bytes(at_dusk: Any) -> None:
+def test_learnt_fields_stay_within_their_bytes(at_dusk):
     with capture_logs() as lines:
         at_dusk.rounds(max_bytes=100).run()
     assert "learn-max-gb" in lines[-1]["problem"]
     assert len(at_dusk.west().field_ids) == 1
 
 
-def test_spent_time_postpones_learning(at_dusk: Any) -> None:
+def test_spent_time_postpones_learning(at_dusk):
     with capture_logs() as lines:
         at_dusk.rounds(cpu_s_per_h=0.001).run()
     assert lines[-1]["event"] == "learning postponed"
     assert len(at_dusk.west().field_ids) == 1
 
 
-def test_of_two_updates_at_once_one_is_published(
-    at_dusk: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    dusk: SplatField,
-    update: Update,
-    tmp_path: Path,
-) -> None:
+def test_of_two_updates_at_once_one_is_published(at_dusk, monkeypatch, dusk, update, tmp_path):
     """Somebody publishes while this process learns: what was learnt was for another state."""
     other_id = save_field(dusk, tmp_path / "other.rff")
 
@@ -290,14 +237,14 @@ def test_of_two_updates_at_once_one_is_published(
     assert [light.field_id for light in at_dusk.west().tile("west").lights] == [other_id]
 
 
-def test_a_damaged_history_is_named(street: Any) -> None:
+def test_a_damaged_history_is_named(street):
     street.rounds().run()
     (street.recordings / LEARNING / "tiles.json").write_text("{")
     with pytest.raises(InvalidInput, match=r"tiles\.json is damaged"):
         street.rounds().run()
 
 
-def test_a_killed_process_is_started_again_and_ends_with_its_server(street: Any) -> None:
+def test_a_killed_process_is_started_again_and_ends_with_its_server(street):
     now_s = [0.0]
     learner = Learner(street.job, LogForm.JSON, lambda _: None, lambda: now_s[0])
     learner.start()
@@ -317,7 +264,7 @@ def test_a_killed_process_is_started_again_and_ends_with_its_server(street: Any)
         os.kill(second, 0)
 
 
-def test_the_process_runs_while_a_processor_is_idle(street: Any) -> None:
+def test_the_process_runs_while_a_processor_is_idle(street):
     learner = Learner(street.job, LogForm.JSON, lambda _: None)
     learner.start()
     try:
@@ -332,15 +279,13 @@ def test_the_process_runs_while_a_processor_is_idle(street: Any) -> None:
 
 @pytest.mark.usefixtures("learnt_before")
 @pytest.mark.parametrize(("max_age_s", "lights"), [(30.0, 0), (90.0, 1)])
-def test_recordings_above_the_age_teach_nothing(
-    at_dusk: Any, max_age_s: float, lights: int
-) -> None:
+def test_recordings_above_the_age_teach_nothing(at_dusk, max_age_s, lights):
     """They were added to a minute ago."""
     at_dusk.rounds(max_age_s=max_age_s).run()
     assert len(at_dusk.west().tile("west").lights) == lights
 
 
-def test_what_was_learnt_is_shown(street: Any) -> None:
+def test_what_was_learnt_is_shown(street):
     """Of the tile's lights, and of the last update, which was withdrawn at last."""
     registry = CollectorRegistry()
     metrics = ServerMetrics(registry)

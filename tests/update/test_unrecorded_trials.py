@@ -1,26 +1,22 @@
 """What a vehicle that is not recorded is shown to suffer, and what of it is kept."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import AsyncIterator
 from unittest.mock import Mock
 
 import pytest
 from structlog.testing import capture_logs
 
 from mec_server.learner import MOST_PAUSE_S, Learner, UnrecordedTrials
-from mec_server.tile_history import Learnt, TileHistory, read_histories, write_histories
+from mec_server.tile_history import Learnt, TileHistory, read_histories
 from mec_server.tile_learning import CHECK_EVERY, CHECK_FRAMES, BitsIncrease
 from mec_server.twin.state import ReceivedPicture
-from rfcore.field import SplatField, save_field
+from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.update.passes import Pass
 from rfcore.wire.settings import LogForm
-from rfcore.wire.tile_manifest import Ground, VersionLabel, publish
-from tests.update.conftest import NOW, NOW_MS, K
+from tests.update.conftest import NOW_MS, K
 
-MakePass = Callable[..., Pass]
 WAIT_S = 60
 
 
@@ -66,8 +62,8 @@ async def watched(noon: SplatField, dusk: SplatField) -> AsyncIterator[Watched]:
 
 
 async def test_a_vehicle_that_is_not_recorded_says_how_many_bits_more_it_took(
-    watched: Watched, noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+    watched, noon, dusk, make_pass
+):
     for light, low, high in ((noon, 5.0, 1e6), (dusk, -100.0, -5.0)):
         drive = make_pass(light, "c" if light is noon else "d")
         for number in range(CHECK_FRAMES):
@@ -78,9 +74,7 @@ async def test_a_vehicle_that_is_not_recorded_says_how_many_bits_more_it_took(
         assert watched.trials._taken == []
 
 
-async def test_its_turn_comes_again_after_so_many_frames(
-    watched: Watched, noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+async def test_its_turn_comes_again_after_so_many_frames(watched, noon, dusk, make_pass):
     drive, other = make_pass(noon, "c"), make_pass(noon, "d")
     for number in range(CHECK_FRAMES):
         watched.trials.saw(seen(drive, dusk.field_id, number))
@@ -102,12 +96,12 @@ async def test_its_turn_comes_again_after_so_many_frames(
 
 
 async def test_nothing_is_taken_of_other_fields_or_lost_cameras_or_what_was_withdrawn(
-    watched: Watched, noon: SplatField, dusk: SplatField, make_pass: MakePass
-) -> None:
+    watched, noon, dusk, make_pass
+):
     drive = make_pass(noon, "c")
     watched.trials.saw(seen(drive, noon.field_id, 0))
     lost = seen(drive, dusk.field_id, 0)
-    lost.frame.pose = None  # type: ignore[misc]
+    lost.frame.pose = None
     watched.trials.saw(lost)
     watched.trials.watch({"west": TileHistory((Learnt("x", "", "y", 1, 9.0, 0, True),))})
     watched.trials.saw(seen(drive, dusk.field_id, 1))
@@ -115,20 +109,11 @@ async def test_nothing_is_taken_of_other_fields_or_lost_cameras_or_what_was_with
 
 
 @pytest.fixture
-def published(street: Any, dusk: SplatField, tmp_path: Path) -> str:
-    """Publish dusk as a light that the process has learnt; return the field's id."""
-    bad_id = save_field(dusk, tmp_path / "bad.rff")
-    (street.recordings / ".learning").mkdir()
-    learnt = Learnt(bad_id, "h17", street.noon_id, 2, 20.0, NOW_MS)
-    write_histories(street.recordings, {"west": TileHistory((learnt,))})
-    label = VersionLabel("h17", "", 2, 17.0)
-    publish(street.fields, "west", tmp_path / "bad.rff", Ground(), NOW, label)
-    return bad_id
+def published(street, dusk):
+    return street.publish_harm(dusk)
 
 
-def test_a_reported_harm_withdraws_what_it_names_if_it_is_large(
-    street: Any, published: str
-) -> None:
+def test_a_reported_harm_withdraws_what_it_names_if_it_is_large(street, published):
     rounds = street.rounds()
     for harm in (
         BitsIncrease("west", published, "c", 2.0),
@@ -146,13 +131,12 @@ def test_a_reported_harm_withdraws_what_it_names_if_it_is_large(
     assert read_histories(street.recordings)["west"].withdrawals == 1
 
 
-def test_the_process_takes_reports(street: Any, published: str) -> None:
+def test_the_process_takes_reports(street, published):
     learner = Learner(street.job, LogForm.JSON, lambda _: None)
     learner.report(BitsIncrease("west", published, "c", 50.0))
     learner.start()
     try:
         learner.report(BitsIncrease("west", published, "c", 50.0))
-        assert learner._process is not None
         assert learner._process.stdin is not None
         deadline_s = WAIT_S
         while street.west().tile("west").lights and deadline_s > 0:

@@ -1,7 +1,6 @@
 """``rfedge field update`` and ``disagree`` on recordings of two vehicles."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +10,12 @@ import pytest
 from rfcore.dataset.source import SourceCamera
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput
-from rfcore.field import SplatField, load_field, save_field
+from rfcore.field import load_field, save_field
 from rfcore.image import read_rgb, write_png
 from rfcore.update.passes import Pass
 from rfedge.cli.field_update import FieldDisagree, FieldUpdate
 from rfedge.fields.describe import disagreement_picture
-
-MakePass = Callable[..., Pass]
+from tests.update.conftest import pasted, sometimes
 
 
 def recorded(folder: Path, drive: Pass) -> Path:
@@ -33,14 +31,7 @@ def recorded(folder: Path, drive: Pass) -> Path:
 
 
 @pytest.mark.parametrize("learn_as", ["all", "delta", "colours"])
-def test_what_pays_is_written(
-    noon: SplatField,
-    dusk: SplatField,
-    make_pass: MakePass,
-    tmp_path: Path,
-    learn_as: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_pays_is_written(noon, dusk, make_pass, tmp_path, learn_as, capsys):
     save_field(noon.compressed(), tmp_path / "noon.rff")
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
     folders = tuple(recorded(tmp_path / drive.identity, drive) for drive in passes)
@@ -49,7 +40,7 @@ def test_what_pays_is_written(
         tmp_path / "noon.rff",
         folders,
         out,
-        learn_as,  # type: ignore[arg-type]
+        learn_as,
         iterations=120,
     ).run()
     said = capsys.readouterr().out
@@ -65,14 +56,7 @@ def test_what_pays_is_written(
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_job_on_ray_learns_the_same_bytes(
-    noon: SplatField,
-    dusk: SplatField,
-    make_pass: MakePass,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_job_on_ray_learns_the_same_bytes(noon, dusk, make_pass, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)  # relative files: workers of Ray run elsewhere
     save_field(noon, Path("noon.rff"))
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
@@ -88,20 +72,9 @@ def test_a_job_on_ray_learns_the_same_bytes(
 
 
 def test_frames_that_agree_with_nobody_are_left_out_and_named(
-    noon: SplatField,
-    dusk: SplatField,
-    make_pass: MakePass,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    noon, dusk, make_pass, tmp_path, capsys
+):
     """Two frames of one pass show another place; of another pass all frames do."""
-
-    def somewhere(number: int, _: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
-        rng = np.random.default_rng(number)
-        return np.kron(rng.integers(0, 255, (8, 12, 3)), np.ones((8, 8, 1))).astype(np.uint8)
-
-    def sometimes(number: int, rgb: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
-        return somewhere(100 + number, rgb) if number in (3, 7) else rgb
 
     save_field(noon, tmp_path / "noon.rff")
     a, b, liar = (
@@ -109,7 +82,7 @@ def test_frames_that_agree_with_nobody_are_left_out_and_named(
         for drive in (
             make_pass(dusk, "a", paint=sometimes),
             make_pass(dusk, "b", 0.15),
-            make_pass(dusk, "liar", paint=somewhere),
+            make_pass(dusk, "liar", paint=pasted),
         )
     )
     update = FieldUpdate(tmp_path / "noon.rff", (a, b, liar), tmp_path / "dusk.rff", "colours")
@@ -122,7 +95,7 @@ def test_frames_that_agree_with_nobody_are_left_out_and_named(
         replace(update, recordings=(b, liar)).run()
 
 
-def test_what_does_not_pay_is_not(noon: SplatField, make_pass: MakePass, tmp_path: Path) -> None:
+def test_what_does_not_pay_is_not(noon, make_pass, tmp_path):
     save_field(noon, tmp_path / "noon.rff")
     folders = [recorded(tmp_path / name, make_pass(noon, name)) for name in "ab"]
     out = tmp_path / "again.rff"
@@ -131,12 +104,10 @@ def test_what_does_not_pay_is_not(noon: SplatField, make_pass: MakePass, tmp_pat
     assert not out.exists()
 
 
-def test_disagreement_is_red_where_something_stands(
-    noon: SplatField, make_pass: MakePass, tmp_path: Path
-) -> None:
+def test_disagreement_is_red_where_something_stands(noon, make_pass, tmp_path):
     """A dark block in a picture that is darker as a whole: the block alone is marked."""
 
-    def block(_: int, rgb: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    def block(_: int, rgb: np.ndarray) -> np.ndarray:
         out = (0.6 * rgb).astype(np.uint8)
         out[16:40, 24:48] = 255
         return out
@@ -151,6 +122,6 @@ def test_disagreement_is_red_where_something_stands(
     assert redness[20:36, 28:44].mean() > 3 * redness[:, 64:].mean()
 
 
-def test_disagreement_without_pictures_is_refused(noon: SplatField) -> None:
+def test_disagreement_without_pictures_is_refused(noon):
     with pytest.raises(InvalidInput, match="no pictures"):
         disagreement_picture(noon, [])

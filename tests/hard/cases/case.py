@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 from rfcore.errors import RfedgeError
 
-__all__ = ["Case", "Finding", "refusal", "statement", "within"]
-
 
 @dataclass(frozen=True)
 class Finding:

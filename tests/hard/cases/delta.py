@@ -20,8 +20,6 @@ from rfcore.image import I420
 from rfcore.metrics import psnr
 from rfcore.views import FieldView
 
-__all__ = ["CASES"]
-
 GROUP = "Delta codec"
 SIZE_PX = (64, 48)
 

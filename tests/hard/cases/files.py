@@ -17,8 +17,6 @@ from rfcore.errors import FieldFormatError
 from rfcore.field.splat_file import read_splat_file, write_ply
 from rfcore.raster.gaussians import Gaussians
 
-__all__ = ["CASES"]
-
 GROUP = "Files"
 
 

@@ -32,8 +32,6 @@ from rfcore.ngp.shape import (
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
 from rfcore.views import View
 
-__all__ = ["CASES"]
-
 GROUP = "Hash grids"
 LIMIT = 2e-5
 """Each of up to 60 samples is good to a few 1e-7; random fields change within a 40th of the box."""
@@ -192,7 +190,7 @@ def _gradients(
         )
     )
     colour, _, _ = reference.render_rays(params, field, rays, most_samples=batch.samples_per_ray)
-    ((colour - torch.tensor(batch.targets, dtype=torch.float64)) ** 2).mean().backward()  # type: ignore[no-untyped-call]
+    ((colour - torch.tensor(batch.targets, dtype=torch.float64)) ** 2).mean().backward()
     wanted = [value.grad.numpy().ravel() for value in params.values() if value.grad is not None]
     return np.concatenate([table.ravel(), matrices]).astype(np.float64), np.concatenate(wanted)
 

@@ -8,8 +8,6 @@ from typing import Any
 from hard.cases.case import Case, Finding
 from rfedge.results import make_result, provenance
 
-__all__ = ["case_row", "stability_result", "unmeasured"]
-
 Row = Mapping[str, Any]
 
 

@@ -14,8 +14,6 @@ from rfcore.errors import InvalidInput
 from rfcore.metrics import psnr, ssim
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb, rgb_from_i420
 
-__all__ = ["CASES"]
-
 GROUP = "Pictures and metrics"
 C1 = (0.01 * 255) ** 2
 Shape = tuple[int, ...]

@@ -11,8 +11,6 @@ from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.motion import interpolated, quaternion_from_vector, rotation_vector
 
-__all__ = ["CASES"]
-
 GROUP = "Poses"
 HALF = (0.5, 0.5, 0.5, 0.5)
 """A third of a turn about the diagonal: x to y, y to z, z to x, exactly, in any precision."""

@@ -18,22 +18,6 @@ from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfcore.views import View
 
-__all__ = [
-    "AHEAD",
-    "PICTURE_LIMIT",
-    "RATES",
-    "TURNED",
-    "arrays_of",
-    "blobs",
-    "gradient_error",
-    "joined",
-    "one_splat",
-    "picture_error",
-    "poisoned",
-    "same_view",
-    "without",
-]
-
 INTRINSICS = Intrinsics(40, 24, 30.0, 30.0, 20.0, 12.0)
 AHEAD = Camera(INTRINSICS, Pose.identity())
 TURNED = Camera(INTRINSICS, Pose((0.1, -0.05, -0.2), (0.96, 0.0, 0.28, 0.0)))
@@ -149,7 +133,7 @@ def gradients(gaussians: Gaussians, camera: Camera, antialiased: bool) -> Gradie
     native.backward(weights)
     params = reference.parameters(gaussians, requires_grad=True)
     colour, _, _ = reference.render(params, camera, antialiased=antialiased)
-    (colour * torch.tensor(weights, dtype=torch.float64)).sum().backward()  # type: ignore[no-untyped-call]
+    (colour * torch.tensor(weights, dtype=torch.float64)).sum().backward()
     return Gradients(native.gradients(), {n: _grad(p) for n, p in params.items()})
 
 
@@ -167,5 +151,4 @@ def gradient_error(
 
 def _grad(parameter: object) -> F64:
     grad = getattr(parameter, "grad", None)
-    assert grad is not None
     return np.asarray(grad.numpy(), dtype=np.float64)

@@ -34,8 +34,6 @@ from rfcore.errors import InvalidInput
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 
-__all__ = ["CASES"]
-
 GROUP = "Gaussians"
 SH0 = 0.28209479177387814
 BALL_COLOUR = 0.5 + SH0

@@ -24,8 +24,6 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.trainable import TrainableRasterizer
 
-__all__ = ["CASES"]
-
 GROUP = "Training"
 GRADIENT_LIMIT = 1e-4
 """Relative, of a parameter group: float32 carries 1e-7, sums of hundreds of pixels cancel some."""

@@ -14,8 +14,6 @@ from rfcore.image import I420
 from rfcore.native.warp import correct_i420, warp_i420
 from rfcore.views import FieldView
 
-__all__ = ["CASES"]
-
 GROUP = "Warp"
 SIZE_PX = (40, 24)
 HALF_TURN = (0.0, 0.0, 1.0, 0.0)

@@ -1,22 +1,14 @@
 """Procedural street-like pictures: smooth shading, edges, texture; all seeded."""
 
-from collections.abc import Callable
-
 import numpy as np
-import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour
 from rfcore.views import FieldView
 
-PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, FieldView]]
-ViewMaker = Callable[[I420], FieldView]
-EveningMaker = Callable[[I420, float], I420]
 
-
-def make_picture(width_px: int, height_px: int, shift_px: float = 0.0, cars: int = 0) -> I420:
+def picture(width_px: int, height_px: int, shift_px: float = 0.0, cars: int = 0) -> I420:
     """Facades, road and sky seen by a camera moved ``shift_px`` to the side, with ``cars``."""
     x, y = np.meshgrid(np.arange(width_px) + shift_px, np.arange(height_px))
     scale = 640 / max(width_px, height_px)
@@ -31,7 +23,7 @@ def make_picture(width_px: int, height_px: int, shift_px: float = 0.0, cars: int
     return i420_from_colour((luma[..., None] * tint).astype(np.float32))
 
 
-def make_view(render: I420) -> FieldView:
+def view_of(render: I420) -> FieldView:
     """Return a view that shows ``render`` and no surface: nothing can be carried from or to it."""
     width_px, height_px = render.size_px
     k = Intrinsics(width_px, height_px, width_px, width_px, width_px / 2, height_px / 2)
@@ -39,18 +31,18 @@ def make_view(render: I420) -> FieldView:
     return FieldView(Camera(k, Pose.identity()), render, depth)
 
 
-def make_pair(width_px: int, height_px: int, shift_px: float = 0.0) -> tuple[I420, FieldView]:
+def pair(width_px: int, height_px: int, shift_px: float = 0.0) -> tuple[I420, FieldView]:
     """Return (camera frame, field's view): the camera sees two cars and noise that the field does
     not know."""
-    camera = make_picture(width_px, height_px, shift_px, cars=2)
+    camera = picture(width_px, height_px, shift_px, cars=2)
     rng = np.random.default_rng(7)
     noise = np.rint(rng.normal(0, 2, camera.y.shape))
     noisy = np.clip(camera.y + noise, 0, 255).astype(np.uint8)
-    view = make_view(make_picture(width_px, height_px, shift_px))
+    view = view_of(picture(width_px, height_px, shift_px))
     return I420(noisy, camera.u, camera.v), view
 
 
-def make_evening(picture: I420, evening: float) -> I420:
+def evening(picture: I420, evening: float) -> I420:
     """Return a street as the sun sets: at 0 as it is, at 1 dark and blue, but for what a lamp on
     the left still lights. No matrix says that: what it adds depends on the place."""
     width_px = picture.size_px[0]
@@ -62,44 +54,14 @@ def make_evening(picture: I420, evening: float) -> I420:
     return I420(*(np.clip(np.rint(p), 1, 255).astype(np.uint8) for p in (y, u, v)))
 
 
-def make_flat(width_px: int, height_px: int, level: int) -> I420:
+def flat(width_px: int, height_px: int, level: int) -> I420:
     half = ((height_px + 1) // 2, (width_px + 1) // 2)
     return I420(*(np.full(s, level, np.uint8) for s in ((height_px, width_px), half, half)))
 
 
-def make_noise(width_px: int, height_px: int, seed: int) -> I420:
+def noise(width_px: int, height_px: int, seed: int) -> I420:
     """Uniform noise over all 256 values, zero included."""
     rng = np.random.default_rng(seed)
     half = ((height_px + 1) // 2, (width_px + 1) // 2)
     shapes = ((height_px, width_px), half, half)
     return I420(*(rng.integers(0, 256, s, dtype=np.uint8) for s in shapes))
-
-
-@pytest.fixture(scope="session")
-def picture() -> PictureMaker:
-    return make_picture
-
-
-@pytest.fixture(scope="session")
-def pair() -> PairMaker:
-    return make_pair
-
-
-@pytest.fixture(scope="session")
-def view_of() -> ViewMaker:
-    return make_view
-
-
-@pytest.fixture(scope="session")
-def evening() -> EveningMaker:
-    return make_evening
-
-
-@pytest.fixture(scope="session")
-def flat() -> PictureMaker:
-    return make_flat
-
-
-@pytest.fixture(scope="session")
-def noise() -> PictureMaker:
-    return make_noise
