@@ -241,15 +241,16 @@ def give_way(nice: int) -> None:
     os.setpriority(os.PRIO_PROCESS, thread, before + nice)  # kept in range there
 
 
-def work_when_idle(thread: int = 0) -> None:
-    """Let a thread (by its native id; 0: the calling one and what it starts) work only while a
-    processor is idle: SCHED_IDLE, see sched(7).
+def work_when_idle() -> None:
+    """Let the calling thread, and what it starts, work only while a processor is idle.
+
+    Sets SCHED_IDLE, see sched(7).
 
     The lowest nice value is not enough. Whoever wakes displaces a thread of SCHED_IDLE at once, one
     of nice 19 not always: beside four vehicles, a process of nice 19 that renders took the p99 of
     decoding from 58 to 78 ms, one of SCHED_IDLE to 62.
     """
-    os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 async def repeat_forever(

@@ -178,7 +178,7 @@ class StreamAccount:
         What an earlier Hello was granted is given back first. Raises ``LimitExceeded``, after
         which nothing but the stream itself is held.
         """
-        self._give_back()
+        self.leave()
         entry, ledger = self._entry, self._entry.ledger
         identity = self.identity if self._named else hello.vehicle_id
         ledger.check_decoders(identity, now)
@@ -196,7 +196,7 @@ class StreamAccount:
             self._granted.append(lambda: entry.cameras.leave(sender))
             entry.cameras.enter(hello, sender, now)
         except LimitExceeded:
-            self._give_back()
+            self.leave()
             raise
         self._cameras = {
             camera.camera_id: CameraMeter(
@@ -281,22 +281,19 @@ class StreamAccount:
 
     def leave(self) -> None:
         """Give back what Hello was granted: decoders, promised time, cameras."""
-        self._give_back()
+        granted, self._granted = self._granted, []
+        self._cameras = {}
+        for give_back in reversed(granted):
+            give_back()
 
     def close(self) -> None:
         """Give back everything."""
-        self._give_back()
+        self.leave()
         self._stream.release()
 
     def _release_decoders(self) -> None:
         if self._decoders is not None:
             self._decoders.release()
-
-    def _give_back(self) -> None:
-        granted, self._granted = self._granted, []
-        self._cameras = {}
-        for give_back in reversed(granted):
-            give_back()
 
 
 class EntryControl:
@@ -313,7 +310,6 @@ class EntryControl:
         self.ledger = Ledger(budgets, now)
         self.promises = Promises(limits, workers, share)
         self.cameras = ActiveCameras()
-        self.render_deadline_s = limits.render_deadline_s
 
     def open(self, session_id: str, identity: str, named: bool, now: float) -> StreamAccount:
         """Return the account of a new stream; raise ``LimitExceeded`` if it is one too many."""

@@ -207,16 +207,6 @@ def read_inria_source(file: Path) -> Source:
     return Source(file, pictures, read_points(points) if points.is_file() else None)
 
 
-def trained_ply(folder: Path) -> Path:
-    """Return the trained Gaussians of the last iteration that a training folder holds."""
-    found = folder.glob("point_cloud/iteration_*/point_cloud.ply")
-    numbered = [(path.parent.name.rpartition("_")[2], path) for path in found]
-    iterations = [(int(digits), path) for digits, path in numbered if digits.isdecimal()]
-    if not iterations:
-        raise DatasetError(f"{folder}: no point_cloud/iteration_N/point_cloud.ply")
-    return max(iterations)[1]
-
-
 def _inria_picture(file: Path, index: int, entry: Any) -> SourcePicture:
     where = f"{file}: [{index}]"
     name = table_at(where, entry).text("img_name")

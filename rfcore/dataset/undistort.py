@@ -63,15 +63,15 @@ def undistorted(rgb: Rgb, intrinsics: Intrinsics, lens: Lens) -> Rgb:
     source = _source_map(intrinsics, lens)
     flat = rgb.reshape(-1, 3)
     width_px = intrinsics.width_px
-    top = _mixed(flat, source.corner, 1, source.right)
-    bottom = _mixed(flat, source.corner + width_px, 1, source.right)
+    top = _mixed(flat, source.corner, source.right)
+    bottom = _mixed(flat, source.corner + width_px, source.right)
     mixed = top + (bottom - top) * source.down[:, None]
     return (mixed + np.float32(0.5)).astype(np.uint8).reshape(rgb.shape)
 
 
-def _mixed(flat: Rgb, first: NDArray[np.intp], step: int, share: F32) -> F32:
+def _mixed(flat: Rgb, first: NDArray[np.intp], share: F32) -> F32:
     a = flat[first].astype(np.float32)
-    return np.asarray(a + (flat[first + step].astype(np.float32) - a) * share[:, None])
+    return np.asarray(a + (flat[first + 1].astype(np.float32) - a) * share[:, None])
 
 
 @lru_cache(maxsize=CACHED_MAPS)

@@ -188,9 +188,9 @@ class GridSplats:
     sh_degree: int
 
 
-def grid_splats(archive: Archive, max_bytes: int = DECODED_BYTES) -> GridSplats:
+def grid_splats(archive: Archive) -> GridSplats:
     """Return the numbers of a compressed archive; raises as ``splats_of_compressed``."""
-    return _Stored.of(archive, max_bytes).grid()
+    return _Stored.of(archive, DECODED_BYTES).grid()
 
 
 def detail_ends(ends: Mapping[str, int]) -> Mapping[float, int]:

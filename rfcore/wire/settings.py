@@ -116,7 +116,7 @@ class LogForm(StrEnum):
     JSON = "json"
 
 
-def configure_logs(stream: TextIO, form: LogForm = LogForm.AUTO, level: int = logging.INFO) -> None:
+def configure_logs(stream: TextIO, form: LogForm = LogForm.AUTO) -> None:
     """Send structlog's events to ``stream``; called once, by a command's ``main``."""
     renderer: structlog.types.Processor
     on_console = stream.isatty() if form is LogForm.AUTO else form is LogForm.CONSOLE
@@ -132,7 +132,7 @@ def configure_logs(stream: TextIO, form: LogForm = LogForm.AUTO, level: int = lo
             structlog.processors.format_exc_info,
             renderer,
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(level),
+        wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
         logger_factory=structlog.PrintLoggerFactory(stream),
         cache_logger_on_first_use=False,
     )

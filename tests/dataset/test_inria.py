@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from rfcore.dataset import read_dataset
-from rfcore.dataset.read import trained_ply
 from rfcore.dataset.source import SourcePoints
 from rfcore.dataset.write import write_points
 from rfcore.errors import DatasetError
@@ -19,16 +18,6 @@ def test_the_points_training_started_from_come_along(golden, tmp_path):
     )
     points = read_dataset(folder).points
     np.testing.assert_array_equal(points.xyz_m, [[1, 2, 3]])
-
-
-def test_the_last_iteration_is_found(tmp_path):
-    for iteration in ("7000", "30000", "x"):
-        folder = tmp_path / "point_cloud" / f"iteration_{iteration}"
-        folder.mkdir(parents=True)
-        (folder / "point_cloud.ply").write_bytes(b"")
-    assert trained_ply(tmp_path).parent.name == "iteration_30000"
-    with pytest.raises(DatasetError, match="no point_cloud/iteration_N"):
-        trained_ply(tmp_path / "point_cloud")
 
 
 @pytest.mark.parametrize("content", [{}, [], [3], [{"img_name": ""}]])
