@@ -79,18 +79,26 @@ def provenance(
 ) -> Provenance:
     """Return how a result is made that is measured now.
 
-    ``command`` defaults to the ``rfedge`` command line of this process, ``at`` to the ``revision``
-    of the checkout. Of ``inputs``, files are hashed; folders are left out: what is read of them
+    ``command`` defaults to the command line of this process, ``at`` to the ``revision`` of the
+    checkout. Of ``inputs``, files are hashed; folders are left out: what is read of them
     is the measurement's to digest.
     """
     at = revision() if at is None else at
     return Provenance(
-        command=shlex.join(["rfedge", *sys.argv[1:]]) if command is None else command,
+        command=command_line() if command is None else command,
         revision=at,
         dirty=None if at == "unknown" else at.endswith(DIRTY),
         host=host(),
         inputs={str(path): _sha256(path) for path in inputs if path.is_file()},
     )
+
+
+def command_line() -> str:
+    """Return how this process was called, quoted for a shell, without the program's folder."""
+    program = Path(sys.argv[0])
+    module = program.parent.name  # of `python -m rfedge`, the program is rfedge/__main__.py
+    name = f"python -m {module}" if program.name == "__main__.py" else program.name
+    return " ".join([name, shlex.join(sys.argv[1:])]).rstrip()
 
 
 def revision(checkout: Path = CHECKOUT) -> str:

@@ -10,9 +10,7 @@ Shares are percentages of a whole frame of the drive with all effects.
 
 from __future__ import annotations
 
-import shlex
 import statistics
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -237,7 +235,7 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> FrameMs:
 
 def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write the rows with the command, the revision and the host that they come from."""
-    made = provenance(command=shlex.join(["streetgen", *sys.argv[1:]]))
+    made = provenance()
     write_result(path, make_result("scene-plan", made, {"rows": list(rows)}))
 
 

@@ -120,9 +120,17 @@ def test_the_flag_says_whether_the_code_had_changes(at, dirty):
     assert provenance(at=at).dirty is dirty
 
 
-def test_the_command_can_be_pasted_into_a_shell(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["/usr/bin/rfedge", "eval", "a b", "c'd"])
-    assert provenance(at="x").command == """rfedge eval 'a b' 'c'"'"'d'"""
+@pytest.mark.parametrize(
+    ("program", "name"),
+    [
+        ("/usr/bin/rfedge", "rfedge"),
+        ("/usr/bin/rfedge-lab", "rfedge-lab"),
+        ("/usr/lib/streetgen/__main__.py", "python -m streetgen"),
+    ],
+)
+def test_the_command_can_be_pasted_into_a_shell(program, name, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [program, "eval", "a b", "c'd"])
+    assert provenance(at="x").command == f"""{name} eval 'a b' 'c'"'"'d'"""
 
 
 def test_inputs_are_named_as_given_with_their_digests_and_folders_left_out(tmp_path):
@@ -243,9 +251,10 @@ def test_a_committed_result_says_how_it_was_made(path):
 def test_no_experiment_writes_over_a_tracked_file_unless_told_to():
     """Everything an experiment writes by default lies below ``out``, which is not tracked."""
     import lab.cli
+    import rfedge.cli
 
     experiments = [each for each in Experiment.__subclasses__() if each.__module__ != __name__]
-    assert {"EvalCompare", lab.cli.EvalAdapt.__name__} <= {each.__name__ for each in experiments}
+    assert {rfedge.cli.measure.EvalCompare, lab.cli.EvalAdapt} <= set(experiments)
     for experiment in experiments:
         assert Path(experiment.out).parts[:2] == ("out", "eval"), experiment
         assert Path(experiment.cells).parts[0] == "out", experiment

@@ -8,9 +8,7 @@ other machines the progress bar's remaining time is the better figure.
 from __future__ import annotations
 
 import os
-import shlex
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -200,5 +198,4 @@ def build_scene(selection: Selection, settings: Settings, console: Console) -> N
 
 
 def _about(job: RenderJob) -> dict[str, Any]:
-    command = shlex.join(["streetgen", *sys.argv[1:]])
-    return {**as_json(provenance(command=command)), "build": origin_of(job)}
+    return {**as_json(provenance()), "build": origin_of(job)}

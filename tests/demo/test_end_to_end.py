@@ -31,6 +31,7 @@ def demo(sample: Path, work: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.timeout(60)  # eight processes in turn: 8 s on two idle cores, more beside other tests
 def test_the_server_ends_up_with_the_vehicles_pictures(tiny_sample, tmp_path):
     done = demo(tiny_sample, tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
