@@ -6,16 +6,13 @@ The terminal shows the summary of the same ``result.json``.
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.console import Console
 from rich.table import Table
 
-from rfcore.files import write_whole
 from rfedge.demo.measure import DriveFigures, FrameFigures, Pictures
 from rfedge.report.charts import (
     DIFFERENCE_GAIN,
@@ -25,6 +22,7 @@ from rfedge.report.charts import (
     quality_chart,
     stages_chart,
 )
+from rfedge.report.page import write_page
 from rfedge.results import Result, as_json, rows_of
 
 __all__ = [
@@ -135,11 +133,11 @@ def write_report(
     ``video`` an MP4 file to embed.
     """
     drives = figures_of(result)
-    environment = Environment(
-        loader=PackageLoader("rfedge.demo", "."), autoescape=True, undefined=StrictUndefined
-    )
-    page = environment.get_template("report.html.j2").render(
-        headline=_headline(drives),
+    write_page(
+        path,
+        "demo/report.html.j2",
+        _headline(drives),
+        {key: result[key] for key in PROVENANCE},
         gain=DIFFERENCE_GAIN,
         video=base64.b64encode(video.read_bytes()).decode() if video is not None else None,
         result=result,
@@ -152,9 +150,7 @@ def write_report(
             for label, show in METRIC
         ],
         sequences=[_sequence(name, drive, pictures[name]) for name, drive in drives.items()],
-        provenance=json.dumps({key: result[key] for key in PROVENANCE}, indent=2),
     )
-    write_whole(path, page)
 
 
 def _headline(drives: Mapping[str, DriveFigures]) -> str:

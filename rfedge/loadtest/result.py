@@ -5,7 +5,6 @@ The result is a JSON file, a page with a figure of the latencies, and a table on
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,13 +13,12 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.console import Console
 
-from rfcore.files import write_whole
 from rfedge.loadtest.plan import Load, Mode, Vehicles
 from rfedge.loadtest.run import Run, TestBed, run_load
 from rfedge.report.charts import RENDER, STYLE, new_axes, svg
+from rfedge.report.page import write_page
 from rfedge.report.tables import text_table
 from rfedge.results import make_result, provenance, write_result
 
@@ -132,26 +130,18 @@ def print_runs(console: Console, result: LoadResult) -> None:
 def write_load_result(result: LoadResult, out: Path) -> None:
     """Write ``result.json`` and ``report.html`` into ``out``."""
     write_result(out / "result.json", result.content)
-    write_whole(out / "report.html", _page(result))
-
-
-def _page(result: LoadResult) -> str:
-    environment = Environment(
-        loader=PackageLoader("rfedge.loadtest", "."), autoescape=True, undefined=StrictUndefined
-    )
-    environment.filters["ms"] = lambda value: "-" if value is None else f"{value:.1f}"
     last, content = result.runs[-1], result.content
     deadline_ms = last.load.bounds.deadline_ms
     latency_ms = {_vehicles(run.load.vehicles): run.latency_ms for run in result.runs}
-    return environment.get_template("loadtest.html.j2").render(
-        headline=result.headline(),
+    write_page(
+        out / "report.html",
+        "loadtest/loadtest.html.j2",
+        result.headline(),
+        {key: content[key] for key in ("command", "revision", "dirty", "host")},
         what=_what(last.load),
         rows=content["rows"],
         deadline_ms=deadline_ms,
         latency_svg=latency_chart(latency_ms, deadline_ms),
-        provenance=json.dumps(
-            {key: content[key] for key in ("command", "revision", "dirty", "host")}, indent=2
-        ),
     )
 
 

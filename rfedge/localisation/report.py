@@ -6,24 +6,22 @@ Matches are found anew for the pictures shown, between the picture and the rende
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Pose
 from rfcore.extras import needs
 from rfcore.field import FULL, Renderer
-from rfcore.files import write_whole
 from rfcore.image import Rgb, rgb_from_colour
 from rfcore.localise.localiser import LocaliserSettings, Lost, Obstacle
 from rfcore.localise.matching import find_features, grey, lift_matches, match_features
 from rfedge.localisation.searches import SearchOutcome, SearchSummary, pose_difference
 from rfedge.report.charts import BLUE, GREY, RENDER, embedded, new_axes, svg
+from rfedge.report.page import write_page
 from rfedge.results import provenance
 
 with needs("localise"):
@@ -47,23 +45,18 @@ def write_localise_report(
     path: Path, field: Renderer, row: SearchSummary, tries: Sequence[SearchOutcome]
 ) -> None:
     """Write the page about the searches of one drive."""
-    environment = Environment(
-        loader=PackageLoader("rfedge.localisation", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-    )
-    page = environment.get_template("report.html.j2").render(
-        headline=f"{row.localised_percent:.1f} % of {row.tries} pictures found their pose",
+    write_page(
+        path,
+        "localisation/report.html.j2",
+        f"{row.localised_percent:.1f} % of {row.tries} pictures found their pose",
+        provenance([]),
         row=row,
         line=str(row),
         position_svg=_chart(tries, "position, m", 0, LEAST_M),
         rotation_svg=_chart(tries, "rotation, degrees", 1, LEAST_DEG),
         shown=[_shown(field, which, attempt) for which, attempt in _chosen(tries)],
         lost=_lost(tries),
-        provenance=json.dumps(provenance([]), indent=2, default=str),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, page)
 
 
 def _chart(tries: Sequence[SearchOutcome], label: str, which: int, least: float) -> str:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rfcore.dataset import Dataset
 from rfcore.field import RadianceField
-from rfcore.files import write_whole
 from rfcore.image import Rgb, rgb_from_colour
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 from rfedge.report.charts import DIFFERENCE_GAIN, amplified_difference, curve_chart, embedded
+from rfedge.report.page import write_page
 
 __all__ = ["write_training_report"]
 
@@ -29,18 +27,15 @@ def write_training_report(
     ``result`` is the content of its JSON. Of ``held_out``, the pictures that it was measured on,
     the page shows the best, the median and the worst.
     """
-    environment = Environment(
-        loader=PackageLoader("rfedge.training", "."), autoescape=True, undefined=StrictUndefined
-    )
-    page = environment.get_template("training.html.j2").render(
-        headline=_headline(result),
+    write_page(
+        path,
+        "training/training.html.j2",
+        _headline(result),
+        {key: result[key] for key in PROVENANCE},
         result=result,
         curve_svg=curve_chart(result["curve"]) if result["curve"] else None,
         strips=_strips(field, held_out) if held_out is not None else [],
-        provenance=json.dumps({key: result[key] for key in PROVENANCE}, indent=2),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, page)
 
 
 PROVENANCE = ("command", "revision", "host", "seed", "settings", "training_digest", "field")
