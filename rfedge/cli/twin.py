@@ -14,9 +14,7 @@ from rfedge.arguments import ADDRESS, DATASET, FOLDER
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rfcore.camera import TileOrigin
     from rfcore.field import RadianceField
-    from rfedge.twin.drive_source import FieldVersions
     from rfedge.twin.scene import TwinScene
     from rfedge.twin.web import Source
 
@@ -106,23 +104,19 @@ class Twin:
     def _field(self, target: str) -> Callable[[TwinScene], Source]:
         from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
-        from rfedge.twin.drive_source import DriveSource
+        from rfedge.twin.drive_source import DriveSource, FollowedFile
 
         if not 0 < self.rate_hz <= 120:
             raise InvalidInput("rate_hz", f"{self.rate_hz:g} is outside 0..120")
-        versions, origin = self._versions(target)
+        field: RadianceField | FollowedFile
+        if self.follow:
+            field, origin = FollowedFile(Path(target), self.threads), None
+        else:
+            field = self._open(target)
+            origin = field.metadata.tile_origin
         drive = read_dataset(self.drive, tile_origin=origin).pictures if self.drive else ()
         name = Path(target).stem
-        return lambda scene: DriveSource(name, versions, drive, self.rate_hz, scene)
-
-    def _versions(self, target: str) -> tuple[FieldVersions, TileOrigin | None]:
-        """Return the field, or the file that is followed; and its origin where it is known."""
-        from rfedge.twin.drive_source import FollowedFile, OneField
-
-        if self.follow:
-            return FollowedFile(Path(target), self.threads), None
-        field = self._open(target)
-        return OneField(field), field.metadata.tile_origin
+        return lambda scene: DriveSource(name, field, drive, self.rate_hz, scene)
 
     def _open(self, target: str) -> RadianceField:
         from rfcore.field import FieldMetadata, SplatField, read_splat_file

@@ -9,7 +9,6 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
 
 from rfcore.field import RadianceField, load_field
 from rfcore.image import jpeg_bytes
@@ -17,29 +16,10 @@ from rfcore.views import PosedPicture
 from rfcore.wire.twin import PictureEncoding
 from rfedge.twin.scene import DrivePicture, PlacedField, TwinScene
 
-__all__ = ["DriveSource", "FieldVersions", "FollowedFile", "OneField"]
+__all__ = ["DriveSource", "FollowedFile"]
 
 LOOK_EVERY_S = 0.5
 TILE = "field"
-
-
-class FieldVersions(Protocol):
-    """A field that may change."""
-
-    def newer(self) -> RadianceField | None:
-        """Return the field where it is not the one that was returned before; may take long."""
-
-
-class OneField:
-    """A field that does not change."""
-
-    def __init__(self, field: RadianceField) -> None:
-        self._field: RadianceField | None = field
-
-    def newer(self) -> RadianceField | None:
-        """Return the field, once."""
-        field, self._field = self._field, None
-        return field
 
 
 class FollowedFile:
@@ -68,7 +48,7 @@ class FollowedFile:
 
 
 class DriveSource:
-    """Shows the newest of ``versions``, and ``pictures`` again and again at ``rate_hz``.
+    """Shows ``field``, or the newest field of a file, and ``pictures`` over and over at ``rate_hz``.
 
     ``name`` is what the page calls the field.
     """
@@ -76,14 +56,14 @@ class DriveSource:
     def __init__(
         self,
         name: str,
-        versions: FieldVersions,
+        field: RadianceField | FollowedFile,
         pictures: Sequence[PosedPicture],
         rate_hz: float,
         scene: TwinScene,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._name = name
-        self._versions = versions
+        self._field = field
         self._pictures = pictures
         self._interval_s = 1.0 / rate_hz
         self._scene = scene
@@ -100,16 +80,23 @@ class DriveSource:
         await asyncio.gather(self._show_fields(), self._show_pictures())
 
     async def _show_fields(self) -> None:
+        if not isinstance(self._field, FollowedFile):
+            await self._show_field(self._field, self._name)
+            return
         count = 0
         while True:
-            field = await asyncio.to_thread(self._versions.newer)
+            field = await asyncio.to_thread(self._field.newer)
             if field is not None:
-                placed = await asyncio.to_thread(PlacedField.of, field, TILE)
-                self._field_id, count = field.field_id, count + 1
-                self._scene.place(placed, self._clock())
+                count += 1
                 said = self._name if count == 1 else f"{self._name}, version {count}"
-                self._scene.connection("offline", said, self._clock())
+                await self._show_field(field, said)
             await asyncio.sleep(LOOK_EVERY_S)
+
+    async def _show_field(self, field: RadianceField, said: str) -> None:
+        placed = await asyncio.to_thread(PlacedField.of, field, TILE)
+        self._field_id = field.field_id
+        self._scene.place(placed, self._clock())
+        self._scene.connection("offline", said, self._clock())
 
     async def _show_pictures(self) -> None:
         if not self._pictures:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from rfcore.camera import Intrinsics, TileOrigin
+from rfcore.camera import TileOrigin
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.spz import encode_spz
 from rfcore.perception.objects import CameraKey, StreetObject
@@ -169,7 +169,7 @@ class TwinScene:
             "origin_m": self._offset_m(picture.field_id),
             "translation_m": picture.pose and picture.pose.translation_m,
             "rotation_wxyz": picture.pose and picture.pose.rotation,
-            "intrinsics": _intrinsics(picture.intrinsics),
+            "intrinsics": asdict(picture.intrinsics),
             "payload_bytes": picture.payload_bytes,
             "references": [reference.name.lower() for reference in picture.references],
             "skipped": picture.skipped,
@@ -281,12 +281,3 @@ def _object(each: StreetObject) -> dict[str, Any]:
     }
 
 
-def _intrinsics(k: Intrinsics) -> dict[str, float]:
-    return {
-        "width_px": k.width_px,
-        "height_px": k.height_px,
-        "fx_px": k.fx_px,
-        "fy_px": k.fy_px,
-        "cx_px": k.cx_px,
-        "cy_px": k.cy_px,
-    }

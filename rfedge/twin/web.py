@@ -30,15 +30,14 @@ from rfcore.wire.address import Address
 from rfcore.wire.twin_render import ViewRequest
 from rfedge.twin.comparing import Comparer
 from rfedge.twin.scene import Board, Message, Reader, TwinScene
+from rfedge.twin.server_source import ServerSource
 
 with needs("twin"):
     from aiohttp import WSCloseCode, WSMsgType, web
 
 __all__ = [
-    "LiveSource",
-    "Look",
-    "MovingView",
-    "Select",
+        "Look",
+        "Select",
     "ShowObjects",
     "Source",
     "TwinRun",
@@ -110,26 +109,6 @@ class ShowObjects:
     shown: bool
 
 
-class MovingView(Protocol):
-    """A live view whose viewpoint moves."""
-
-    def look(self, request: ViewRequest | None) -> None:
-        """Show this viewpoint from now on; None: nothing."""
-
-    def close(self) -> None:
-        """Ask for nothing any more."""
-
-
-class LiveSource(Protocol):
-    """A source that also shows objects, and the street from anywhere."""
-
-    def open_view(self, send: Callable[[Message], object]) -> MovingView:
-        """Return a view for one browser; ``send`` takes its messages."""
-
-    def want_objects(self, wanted: bool) -> None:
-        """Count one browser more, or less, that shows objects."""
-
-
 class TwinWeb:
     """Serves the page, its splats, and the board's messages; with ``live`` also objects and views
     from anywhere."""
@@ -141,7 +120,7 @@ class TwinWeb:
         scene: TwinScene,
         comparer: Comparer,
         clock: Callable[[], float] = time.monotonic,
-        live: LiveSource | None = None,
+        live: ServerSource | None = None,
     ) -> None:
         self._settings = settings
         self._live = live
@@ -277,7 +256,7 @@ class TwinWeb:
 class _User:
     """The interests of one browser's user: a camera, objects, a live view."""
 
-    def __init__(self, comparer: Comparer, live: LiveSource | None, reader: Reader) -> None:
+    def __init__(self, comparer: Comparer, live: ServerSource | None, reader: Reader) -> None:
         self._comparer = comparer
         self._live = live
         self._camera: CameraKey | None = None
@@ -351,7 +330,7 @@ class Source(Protocol):
     """A source of fields and pictures; ``live``: whether it can show more."""
 
     @property
-    def live(self) -> LiveSource | None:
+    def live(self) -> ServerSource | None:
         """The source itself, if it shows objects and views from anywhere."""
 
     def run(self) -> Coroutine[Any, Any, None]:
