@@ -10,7 +10,6 @@ from tyro.conf import subcommand
 
 from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.dataset import Dataset
-from rfedge.cli.demo import Demo
 from rfedge.cli.field import Field
 from rfedge.cli.localise import Localise
 from rfedge.cli.measure import Eval, LoadTest
@@ -19,6 +18,7 @@ from rfedge.cli.services import Certs, Link, Watch
 from rfedge.cli.size import Size
 from rfedge.cli.train import Train
 from rfedge.cli.twin import Twin
+from rfedge.demo import Demo
 from rfedge.program import CONFIG, run_program
 
 __all__ = ["main", "parse"]

@@ -371,14 +371,14 @@ def _check_out(out: Path, suffix: str) -> None:
 
 @dataclass(frozen=True)
 class FieldAnchor:
-    """State or show where on the Earth a field is, for poses from satellite navigation."""
+    """State where on the Earth a field is, for poses from satellite navigation; `info` shows it."""
 
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name."""
-    at: Annotated[tuple[float, float, float] | None, arg(metavar="LATITUDE LONGITUDE HEIGHT")] = (
-        None
-    )
-    """WGS 84, degrees, and metres above the ellipsoid; without this the anchor is shown."""
+    at: Annotated[tuple[float, float, float], arg(metavar="LATITUDE LONGITUDE HEIGHT")]
+    """WGS 84, degrees, and metres above the ellipsoid."""
+    out: Annotated[Path, RFF]
+    """The archive to write. Another anchor makes another field id."""
     point_m: Annotated[tuple[float, float, float], arg(metavar="X Y Z")] = (0.0, 0.0, 0.0)
     """The point of the field that is there, m; default: its origin."""
     enu_from_world: Annotated[tuple[float, float, float, float], arg(metavar="W X Y Z")] = (
@@ -388,21 +388,13 @@ class FieldAnchor:
         0.0,
     )
     """Rotation of the field's axes to east, north, up; default: they are these."""
-    out: Annotated[Path | None, RFF] = None
-    """The archive to write; with --at. Another anchor makes another field id."""
 
     def run(self) -> None:
-        """Show the anchor, or write the field with another."""
-        from rfcore.errors import InvalidInput
+        """Write the field with the anchor."""
         from rfcore.field.store import anchored_file
         from rfcore.geodesy import Anchor
         from rfedge.fields.describe import anchor_text
 
-        if (self.at is None) != (self.out is None):
-            raise InvalidInput("at", "goes with --out: the field with an anchor is another field")
-        if self.at is None or self.out is None:
-            print(anchor_text(open_field(self.field, threads=1).metadata.anchor))
-            return
         _check_out(self.out, ".rff")
         anchor = Anchor(*self.at, self.enu_from_world, self.point_m)
         field_id = anchored_file(field_path(self.field), anchor, self.out)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 
 from rich.console import Console
@@ -23,7 +23,6 @@ from rfedge.training.finish import SizeGoal, finish_field
 from rfedge.training.run import TrainingJob, train_field
 
 __all__ = [
-    "FieldChoice",
     "cache_path",
     "check_sample_field",
     "choose_field",
@@ -35,30 +34,23 @@ __all__ = [
 SEED = 1
 
 
-@dataclass(frozen=True)
-class FieldChoice:
-    """Which field a demo uses; ``anew``: train even if there is one already."""
-
-    sample: Path
-    cache: Path
-    training: SplatTrainingConfig
-    anew: bool
-
-
-def choose_field(choice: FieldChoice, console: Console) -> Path:
+def choose_field(
+    sample: Path, cache: Path, training: SplatTrainingConfig, console: Console, *, anew: bool
+) -> Path:
     """Return the archive of the demo's field, training it if there is none for these settings.
 
+    ``anew``: train even if there is one.
     Raises ``FieldFormatError`` or ``DatasetError`` when the field that is there is damaged or was
     made from another sample; the message says to train anew.
     """
-    shipped = sample_field_path(choice.sample)
-    if not choice.anew and _is_default(choice.training) and shipped.exists():
-        check_sample_field(choice.sample)
+    shipped = sample_field_path(sample)
+    if not anew and _is_default(training) and shipped.exists():
+        check_sample_field(sample)
         return _announced(shipped, console)
-    path = cache_path(choice.sample, choice.cache, choice.training)
-    if path.exists() and not choice.anew:
+    path = cache_path(sample, cache, training)
+    if path.exists() and not anew:
         return _announced(path, console)
-    field = trained_field(choice.sample, choice.training, console)
+    field = trained_field(sample, training, console)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_field(field, path)
     return path

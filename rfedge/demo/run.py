@@ -22,8 +22,8 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, load_field, render_field_view
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import rgb_from_i420
-from rfcore.train.splats import SplatTrainingConfig
-from rfedge.demo.field import FieldChoice, choose_field
+from rfedge.demo import Demo
+from rfedge.demo.field import choose_field
 from rfedge.demo.measure import (
     DriveFigures,
     DriveOutcome,
@@ -33,11 +33,11 @@ from rfedge.demo.measure import (
 )
 from rfedge.processes import command_of, run_to_end, service
 from rfedge.results import make_result, provenance, write_result
+from rfedge.training.run import training_config
 from rfedge.video import write_mp4
 
 __all__ = [
     "DemoRun",
-    "DemoSettings",
     "run_demo",
 ]
 
@@ -47,31 +47,6 @@ CAMERA = "front"
 RECORDED = "recorded"
 """Folder of the pictures that the server reconstructed of a drive, as a dataset."""
 DRIVE_TIMEOUT_S = 300.0
-
-
-@dataclass(frozen=True)
-class DemoSettings:
-    """Settings of the demo; see ``rfedge demo --help``."""
-
-    sample: Path
-    out: Path
-    cache: Path
-    train_anew: bool
-    training: SplatTrainingConfig
-    rate_hz: float
-    link_bps: float
-    link_delay_ms: float
-    effort: str
-    preset: str
-    crf: float
-    threads: int
-
-    def __post_init__(self) -> None:
-        if not self.link_bps > 0:
-            raise InvalidInput("link-bps", f"{self.link_bps:g} must be above 0 bit/s")
-        if not self.rate_hz > 0:
-            raise InvalidInput("rate-hz", f"{self.rate_hz:g} must be above 0 Hz")
-        check_effort("effort", self.effort)
 
 
 @dataclass(frozen=True)
@@ -97,17 +72,24 @@ class DemoRun:
                     )
 
 
-def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
+def run_demo(settings: Demo, console: Console) -> DemoRun:
     """Run the processes, measure, and write ``result.json`` and ``reconstructed.mp4``.
 
-    Raises ``RfedgeError`` naming the process or file that failed. Nothing is written to
-    ``settings.out`` before the sample has been verified.
+    Raises ``InvalidInput`` for a setting, ``RfedgeError`` naming the process or file that failed.
+    Nothing is written to ``settings.out`` before the sample has been verified.
     """
+    if not settings.link_bps > 0:
+        raise InvalidInput("link-bps", f"{settings.link_bps:g} must be above 0 bit/s")
+    if not settings.rate_hz > 0:
+        raise InvalidInput("rate-hz", f"{settings.rate_hz:g} must be above 0 Hz")
+    check_effort("effort", settings.effort)
     console.print(f"[bold]Sample[/] {settings.sample}: verifying")
     verify_manifest(settings.sample)
     _refuse_foreign_folder(settings.out)
-    choice = FieldChoice(settings.sample, settings.cache, settings.training, settings.train_anew)
-    field_path = choose_field(choice, console)
+    training = training_config(settings.gaussians, settings.iterations, settings.threads)
+    field_path = choose_field(
+        settings.sample, settings.cache, training, console, anew=settings.train
+    )
     shutil.rmtree(settings.out, ignore_errors=True)
     field = load_field(field_path, threads=settings.threads)
     elsewhere = _elsewhere(settings.sample, field)
@@ -147,7 +129,7 @@ def _refuse_foreign_folder(folder: Path) -> None:
 
 
 def _drive_outcome(
-    settings: DemoSettings, drive: str, field_path: Path, field: RadianceField, elsewhere: Rgb
+    settings: Demo, drive: str, field_path: Path, field: RadianceField, elsewhere: Rgb
 ) -> DriveOutcome:
     work = settings.out / "work" / drive
     work.mkdir(parents=True)
@@ -178,7 +160,7 @@ def _drive_outcome(
 
 
 def _run_processes(
-    settings: DemoSettings, drive_path: Path, field_path: Path, field_id: str, work: Path
+    settings: Demo, drive_path: Path, field_path: Path, field_id: str, work: Path
 ) -> None:
     server_command = [
         *command_of("mec-server"),

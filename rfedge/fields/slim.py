@@ -25,7 +25,7 @@ from rfcore.field.importance import (
 )
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
-from rfcore.train.levels import LevelFitConfig, Progress, fitted
+from rfcore.train.levels import LevelFitConfig, fitted
 from rfedge.fields.viewpoints import look_around
 
 __all__ = ["slimmed"]
@@ -42,7 +42,6 @@ def slimmed(
     keep: int,
     cameras: Sequence[Camera] = (),
     config: LevelFitConfig | None = None,
-    progress: Progress | None = None,
 ) -> SplatField:
     """Return a field of the ``keep`` splats that matter most; its levels are plain prefixes.
 
@@ -62,7 +61,7 @@ def slimmed(
     if keep < field.primitives:
         if cameras:
             full = field.rasterizer()
-            kept = fitted(_wider(kept, settings.widening), full, cameras, settings, progress)
+            kept = fitted(_wider(kept, settings.widening), full, cameras, settings)
         else:
             kept = _best_widening(field, kept)
     metadata = replace(field.metadata, held_out_psnr_db=None, held_out_ssim=None)

@@ -40,6 +40,10 @@ F64 = NDArray[np.float64]
 UPS = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 """Up in ENU, in OpenGL's world, and in the world of OpenCV and most COLMAP models."""
 FIELD_OF_VIEW_RAD = math.radians(75)
+ELEVATION_RAD = math.radians(25)
+"""Height of an orbit above the horizon of its middle."""
+DISTANCE = 1.5
+"""Distance of an orbit from its middle, in units of the field's radius."""
 
 
 @dataclass(frozen=True)
@@ -50,17 +54,12 @@ class OrbitSettings:
     width_px: int = 960
     height_px: int = 540
     up: str = "z"
-    elevation_rad: float = math.radians(25)
-    distance: float = 1.5
-    """In units of the field's radius."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= 100_000:
             raise InvalidInput("frames", f"{self.frames} is outside 1..100000")
         if self.up not in UPS:
             raise InvalidInput("up", f"'{self.up}' is none of {', '.join(UPS)}")
-        if not 0.01 <= self.distance <= 100:
-            raise InvalidInput("distance", f"{self.distance} is outside 0.01..100")
 
 
 def orbit(field: RadianceField, settings: OrbitSettings) -> list[Camera]:
@@ -69,24 +68,23 @@ def orbit(field: RadianceField, settings: OrbitSettings) -> list[Camera]:
     up = np.array(UPS[settings.up])
     east, north = _across(up)
     intrinsics = _intrinsics(settings.width_px, settings.height_px)
-    rise, reach = math.sin(settings.elevation_rad), math.cos(settings.elevation_rad)
+    rise, reach = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
     cameras = []
     for turn_rad in np.linspace(0, 2 * math.pi, settings.frames, endpoint=False):
         outward = reach * (math.cos(turn_rad) * east + math.sin(turn_rad) * north) + rise * up
-        eye = middle + settings.distance * radius_m * outward
+        eye = middle + DISTANCE * radius_m * outward
         cameras.append(Camera(intrinsics, looking_at(eye, middle, up)))
     return cameras
 
 
-def look_around(
-    field: RadianceField, width_px: int = 640, height_px: int = 360, up: str = "z"
-) -> list[Camera]:
-    """Return four cameras in the middle of the field, a quarter turn apart."""
+def look_around(field: RadianceField, width_px: int, height_px: int) -> list[Camera]:
+    """Return four cameras in the middle of the field, a quarter turn apart, z being up."""
     middle, radius_m = middle_of(field)
-    east, north = _across(np.array(UPS[up]))
+    up = np.array(UPS["z"])
+    east, north = _across(up)
     intrinsics = _intrinsics(width_px, height_px)
     return [
-        Camera(intrinsics, looking_at(middle, middle + radius_m * way, np.array(UPS[up])))
+        Camera(intrinsics, looking_at(middle, middle + radius_m * way, up))
         for way in (east, north, -east, -north)
     ]
 

@@ -7,6 +7,7 @@ Matches are found anew for the pictures shown, between the picture and the rende
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ def write_localise_report(
         path,
         "localisation/report.html.j2",
         f"{row.localised_percent:.1f} % of {row.tries} pictures found their pose",
-        provenance([]),
+        asdict(provenance()),
         row=row,
         line=str(row),
         position_svg=_chart(tries, "position, m", 0, LEAST_M),

@@ -175,21 +175,10 @@ def searches_from_displaced(
     """
     if tries < 1:
         raise InvalidInput("tries", f"{tries} tries: at least 1 is needed")
-    return _from_displaced(field, pictures, error, tries, rng)
-
-
-def _from_displaced(
-    field: Renderer,
-    pictures: Sequence[PosedPicture],
-    error: StartError,
-    tries: int,
-    rng: np.random.Generator,
-) -> Iterator[SearchOutcome]:
-    for number in range(tries):
-        picture = pictures[number % len(pictures)]
-        start = displaced(picture.camera.world_from_cam, error, rng)
-        prior = PosePrior(start, error.position_m, error.rotation_deg)
-        yield search(field, picture, picture.read(), prior)
+    taken = [pictures[number % len(pictures)] for number in range(tries)]
+    starts = (displaced(picture.camera.world_from_cam, error, rng) for picture in taken)
+    priors = (PosePrior(start, error.position_m, error.rotation_deg) for start in starts)
+    return searches_from(field, taken, priors)
 
 
 def searches_from(

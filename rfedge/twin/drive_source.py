@@ -48,9 +48,9 @@ class FollowedFile:
 
 
 class DriveSource:
-    """Shows ``field``, or the newest field of a file, and ``pictures`` over and over at ``rate_hz``.
+    """Shows ``field``, or the newest field of a file, and ``pictures`` again and again.
 
-    ``name`` is what the page calls the field.
+    ``rate_hz``: pictures a second; ``name`` is what the page calls the field.
     """
 
     def __init__(

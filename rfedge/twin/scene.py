@@ -279,5 +279,3 @@ def _object(each: StreetObject) -> dict[str, Any]:
         "seen_by": ["/".join(camera) for camera in each.seen_by],
         "doubtful": each.is_doubtful,
     }
-
-

@@ -36,8 +36,8 @@ with needs("twin"):
     from aiohttp import WSCloseCode, WSMsgType, web
 
 __all__ = [
-        "Look",
-        "Select",
+    "Look",
+    "Select",
     "ShowObjects",
     "Source",
     "TwinRun",

@@ -285,7 +285,7 @@ def test_a_field_gets_an_anchor_and_keeps_it(tmp_path, capsys, splats):
     anchored = tmp_path / "anchored.rff"
     FieldAnchor(street, at=(48.137, 11.575, 519.0), out=anchored).run()
     capsys.readouterr()
-    FieldAnchor(anchored).run()
+    FieldInfo(anchored).run()
     assert "48.13700000, 11.57500000 deg, 519.000 m" in capsys.readouterr().out
     again = tmp_path / "again.rff"
     FieldAnchor(anchored, at=(48.0, 11.0, 0.0), out=again).run()
@@ -293,8 +293,3 @@ def test_a_field_gets_an_anchor_and_keeps_it(tmp_path, capsys, splats):
     assert field.metadata.anchor == Anchor(48.0, 11.0)
     assert replace(field.metadata, anchor=None) == before.metadata
     assert field.field_id != before.field_id
-
-
-def test_an_anchor_without_an_archive_to_write_is_refused(tmp_path):
-    with pytest.raises(InvalidInput, match="goes with --out"):
-        FieldAnchor(tmp_path / "street.rff", at=(48.0, 11.0, 0.0)).run()

@@ -13,7 +13,7 @@ from rfcore.errors import DatasetError, FieldFormatError, InvalidData
 from rfcore.field import SplatField, load_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.train.splats import SplatTrainingConfig
-from rfedge.demo.field import FieldChoice, cache_path, choose_field, sample_field_path
+from rfedge.demo.field import cache_path, choose_field, sample_field_path
 from rfedge.results import provenance
 
 CONFIG = SplatTrainingConfig(gaussians=100, iterations=3)
@@ -24,7 +24,7 @@ BY_HAND = provenance(command="by hand", at="v1")
 def chosen(
     sample: Path, cache: Path, config: SplatTrainingConfig = CONFIG, anew: bool = False
 ) -> Path:
-    return choose_field(FieldChoice(sample, cache, config, anew), SILENT)
+    return choose_field(sample, cache, config, SILENT, anew=anew)
 
 
 def test_a_trained_field_is_found_again(tiny_sample, tmp_path):

@@ -23,7 +23,7 @@ def test_an_orbit_keeps_the_middle_in_the_middle_and_up_upright(place, up):
 
 
 def test_four_cameras_look_around_from_the_middle(place):
-    cameras = look_around(place.field)
+    cameras = look_around(place.field, 640, 360)
     middle = np.median(place.field.gaussians.means, axis=0)
     ways = [np.array(c.world_from_cam.rotation_matrix())[:, 2] for c in cameras]
     np.testing.assert_allclose([c.world_from_cam.translation_m for c in cameras], [middle] * 4)
@@ -43,7 +43,7 @@ def test_a_camera_looks_where_it_is_told():
     np.testing.assert_allclose(pose.apply((0, 1, 0)), (1, 2, 2), atol=1e-12)
 
 
-@pytest.mark.parametrize("wrong", [{"frames": 0}, {"up": "x"}, {"distance": 0.0}])
+@pytest.mark.parametrize("wrong", [{"frames": 0}, {"up": "x"}])
 def test_an_orbit_that_is_none_is_refused(wrong):
     with pytest.raises(InvalidInput, match=next(iter(wrong))):
         OrbitSettings(**wrong)
