@@ -14,11 +14,12 @@ from rfedge.cli.field import Field
 from rfedge.cli.localise import Localise
 from rfedge.cli.measure import Eval, LoadTest
 from rfedge.cli.render import Render
-from rfedge.cli.services import Certs, Link, Watch
+from rfedge.cli.services import Certs, Watch
 from rfedge.cli.size import Size
 from rfedge.cli.train import Train
 from rfedge.cli.twin import Twin
 from rfedge.demo import Demo
+from rfedge.link import LinkSettings
 from rfedge.program import CONFIG, run_program
 
 __all__ = ["main", "parse"]
@@ -31,7 +32,7 @@ Verb = (
     | Annotated[Encode, subcommand("encode")]
     | Annotated[Decode, subcommand("decode")]
     | Annotated[Localise, subcommand("localise")]
-    | Annotated[Link, subcommand("link")]
+    | Annotated[LinkSettings, subcommand("link")]
     | Annotated[LoadTest, subcommand("loadtest")]
     | Annotated[Size, subcommand("size")]
     | Annotated[Dataset, subcommand("dataset")]

@@ -1,4 +1,4 @@
-"""What runs beside the services: ``rfedge link``, ``rfedge watch`` and ``rfedge certs``."""
+"""What runs beside the services: ``rfedge watch`` and ``rfedge certs``."""
 
 from __future__ import annotations
 
@@ -8,51 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import ADDRESS, FOLDER, JSON
+from rfedge.arguments import ADDRESS, FOLDER
 
 if TYPE_CHECKING:
     from rfcore.wire.twin_client import TwinClient
     from rfedge.watch import PictureSource
 
-__all__ = ["Certs", "CertsInit", "CertsShow", "Link", "Watch"]
+__all__ = ["Certs", "CertsInit", "CertsShow", "Watch"]
 
 PEM = arg(metavar="FILE.pem")
-
-
-@dataclass(frozen=True)
-class Link:
-    """Forward TCP between a vehicle and a server at a limited throughput and with a delay."""
-
-    to: Annotated[str, ADDRESS]
-    """Where to connect for each accepted connection, HOST:PORT."""
-    listen: Annotated[str, ADDRESS] = "127.0.0.1:0"
-    """Where to accept connections, HOST:PORT; port 0 takes a free one."""
-    also: Annotated[tuple[str, ...], arg(metavar="LISTEN=TO ...")] = ()
-    """Further servers over the same link, each LISTEN=TO: a radio link shared by several paths."""
-    profile: Annotated[Path | None, arg(metavar="FILE.toml")] = None
-    """Link profile (TOML, see samples/links): traces, jitter, outages, lost connections."""
-    uplink_bps: float | None = None
-    """Throughput from the accepting side to `--to`, bit/s; 4e6 without a profile."""
-    downlink_bps: float | None = None
-    """Throughput of the way back, bit/s; 4e6 without a profile."""
-    delay_ms: float | None = None
-    """One-way delay in either direction, ms; 20 without a profile."""
-    metrics_port: Annotated[int | None, arg(metavar="PORT")] = None
-    """Port for Prometheus; 0 takes a free one, none are served without it."""
-    metrics_host: Annotated[str, arg(metavar="HOST")] = "127.0.0.1"
-    """Address the metrics are served on."""
-    report: Annotated[Path | None, JSON] = None
-    """Write bytes, busy time and timing error here as JSON."""
-    ready_file: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Write HOST:PORT here once listening."""
-    allow_insecure: bool = False
-    """Forward plaintext to or from other machines."""
-
-    def run(self) -> None:
-        """Forward until SIGTERM or SIGINT."""
-        from rfedge.link.proxy import ProxySettings, run_proxy
-
-        run_proxy(ProxySettings(**vars(self)))
 
 
 @dataclass(frozen=True)

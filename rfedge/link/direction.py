@@ -2,16 +2,18 @@
 
 Packets are callbacks: what is pushed is called when it is due.
 
-``LinkMetrics`` reads both directions for Prometheus; all its names begin with ``rfedge_link_``.
+``Side`` is one end of one connection through the link, as an asyncio protocol. ``LinkMetrics``
+reads both directions for Prometheus; all its names begin with ``rfedge_link_``.
 """
 
 from __future__ import annotations
 
 import asyncio
+import socket
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -20,27 +22,16 @@ from prometheus_client.registry import Collector
 from rfcore.link.plan import DirectionPlan
 from rfcore.link.shaper import BusyMeter, Link
 from rfcore.wire.instruments import Family, Instruments
+from rfedge.link import SPIN_S
 
-__all__ = ["SPIN_S", "Direction", "LinkMetrics", "Sender"]
-
-SPIN_S = 0.0002
-"""Time before a release at which the pump stops sleeping and yields in a loop: the kernel's timer
-slack of 50 us and the loop's own time. Longer would make the scheduler see a busy process and
-interrupt it just when it matters. Many links in one process would spin all the time, so they use
-0."""
+__all__ = ["Direction", "LinkMetrics", "Side"]
 
 
-class Sender(Protocol):
-    """Pushes into a direction, and can be made to wait."""
+SEGMENT_BYTES = 4096
+"""Bytes released at once: 8 ms at 4 Mbit/s, so that a long message does not arrive in one lump."""
 
-    def hold(self, reason: str) -> None:
-        """Push nothing until ``resume`` with the same reason."""
-
-    def resume(self, reason: str) -> None:
-        """Push again, if no other reason holds."""
-
-    def abort(self) -> None:
-        """Push nothing any more."""
+READ_BYTES = 16 * 1024
+SOCKET_BUFFER_BYTES = 64 * 1024
 
 
 @dataclass(frozen=True)
@@ -65,7 +56,7 @@ class Direction:
         spin_s: float = SPIN_S,
     ) -> None:
         self.meter = BusyMeter()
-        self.senders: set[Sender] = set()
+        self.senders: set[Side] = set()
         self.profile = plan.profile
         self._transit = transit
         self._spin_s = spin_s
@@ -134,6 +125,105 @@ class Direction:
             "busy_periods": meter.periods,
             "largest_lateness_s": meter.largest_lateness_s,
         }
+
+
+class Side(asyncio.BufferedProtocol):
+    """One end of one connection: what it sends goes into ``outward``, to ``peer``."""
+
+    def __init__(self, outward: Direction, ended: Callable[[], None]) -> None:
+        self.peer: Side | None = None
+        self.transport: asyncio.Transport | None = None
+        self._outward = outward
+        self._ended = ended
+        self._buffer = bytearray(READ_BYTES)
+        self._held: set[str] = set()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Wait for the other end before reading anything; asyncio has set TCP_NODELAY."""
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        transport.set_write_buffer_limits(SOCKET_BUFFER_BYTES)
+        self._outward.senders.add(self)
+        self.hold("peer")
+
+    def join(self, peer: Side) -> None:
+        """Send what comes in here to ``peer``."""
+        self.peer = peer
+        self.resume("peer")
+
+    def hold(self, reason: str) -> None:
+        """Stop reading until ``reason`` is gone."""
+        if not self._held and self.transport is not None:
+            self.transport.pause_reading()
+        self._held.add(reason)
+
+    def resume(self, reason: str) -> None:
+        """Read again if ``reason`` was the last one against it."""
+        if self._held == {reason} and self.transport is not None:
+            self.transport.resume_reading()
+        self._held.discard(reason)
+
+    def abort(self) -> None:
+        """Close at once."""
+        if self.transport is not None:
+            self.transport.abort()
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether the socket is connected and not being closed."""
+        return self.transport is not None and not self.transport.is_closing()
+
+    def bound_receive_buffer(self) -> None:
+        """Limit the kernel's buffer, which would hide seconds of data behind the link's queue."""
+        if self.transport is not None:
+            sock = self.transport.get_extra_info("socket")
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BUFFER_BYTES)
+
+    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
+        """Offer no more than the link has room for."""
+        return memoryview(self._buffer)[: max(1, min(READ_BYTES, self._outward.room_bytes))]
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Push what came in, in segments."""
+        data = bytes(self._buffer[:nbytes])
+        for start in range(0, nbytes, SEGMENT_BYTES):
+            segment = data[start : start + SEGMENT_BYTES]
+            self._outward.push(lambda part=segment: self._deliver(part), len(segment))  # type: ignore[misc]
+
+    def eof_received(self) -> bool:
+        """Pass the end on behind the data; keep our own direction open."""
+        self._outward.push(self._deliver_end, 0)
+        return True
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
+        """Take the other end down too, after what is under way."""
+        self._outward.senders.discard(self)
+        self._outward.push(self._close_peer, 0)
+        self._ended()
+
+    def pause_writing(self) -> None:
+        """Stop the other end, since our socket takes no more."""
+        if self.peer is not None:
+            self.peer.hold("receiver")
+
+    def resume_writing(self) -> None:
+        """Let the other end go on, since our socket takes data again."""
+        if self.peer is not None:
+            self.peer.resume("receiver")
+
+    def _deliver(self, data: bytes) -> None:
+        if self.peer is not None and self.peer.transport is not None:
+            self.peer.transport.write(data)
+
+    def _deliver_end(self) -> None:
+        transport = self.peer.transport if self.peer is not None else None
+        if transport is not None and transport.can_write_eof() and not transport.is_closing():
+            with suppress(OSError):  # the other end is gone, and the event loop did not hear of it
+                transport.write_eof()
+
+    def _close_peer(self) -> None:
+        if self.peer is not None and self.peer.transport is not None:
+            self.peer.transport.close()
 
 
 async def _sleep_until(due_s: float, spin_s: float) -> None:

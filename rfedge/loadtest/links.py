@@ -15,7 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rfcore.files import write_whole
-from rfedge.link.proxy import LinkProxy, ProxySettings
+from rfedge.link import LinkSettings
+from rfedge.link.proxy import LinkProxy
 
 __all__ = ["main", "run_links"]
 
@@ -24,7 +25,7 @@ async def run_links(profile: Path, count: int, server: str, report: Path, ready:
     """Forward until SIGTERM."""
     stopped = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stopped.set)
-    settings = ProxySettings(to=server, profile=profile, spin_s=0.0)
+    settings = LinkSettings(to=server, profile=profile, spin_s=0.0)
     proxies = [LinkProxy(settings) for _ in range(count)]
     addresses = [await proxy.start() for proxy in proxies]
     write_whole(ready, "".join(f"{address}\n" for address in addresses))

@@ -24,7 +24,7 @@ from rfcore.wire.tls import TlsFiles
 from rfedge.cli import Verb
 from rfedge.cli.field_tiles import FieldPublish
 from rfedge.cli.services import CertsInit
-from rfedge.link.proxy import ProxySettings
+from rfedge.link import LinkSettings
 from rfedge.twin.web import WebSettings
 from scripts import ROOT, loaded
 
@@ -166,7 +166,7 @@ def test_every_link_leads_from_a_vehicle_to_a_server_that_its_certificate_names(
     assert set(made.hosts) == {*servers, *links, "localhost", "127.0.0.1"}
     for name in links:
         link = verb_of(name)
-        paths = ProxySettings(link.to, listen=link.listen, also=link.also, allow_insecure=True)
+        paths = LinkSettings(link.to, listen=link.listen, also=link.also, allow_insecure=True)
         assert [str(to) for _, to in paths.paths()] == [f"{server}:50051" for server in servers]
         read_link(host_path(name, str(link.profile)))
     for name in running("cav-agent"):

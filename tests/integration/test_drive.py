@@ -19,7 +19,8 @@ from rfcore.dataset import read_dataset
 from rfcore.image import I420, read_rgb, write_png
 from rfcore.native.backend import available_isas
 from rfcore.wire.settings import RenderSettings
-from rfedge.link.proxy import LinkProxy, ProxySettings
+from rfedge.link import LinkSettings
+from rfedge.link.proxy import LinkProxy
 
 
 async def test_the_server_ends_up_with_the_pictures_of_the_vehicles_closed_loop(
@@ -135,7 +136,7 @@ async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_enc
     serve: Any, travel: Any
 ) -> None:
     async with serve() as server:
-        proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=60e3, delay_ms=1.0))
+        proxy = LinkProxy(LinkSettings(str(server.address), uplink_bps=60e3, delay_ms=1.0))
         await proxy.start()
         record = await travel(proxy.address, pace=PaceKind.REALTIME, rate=200.0)
         await proxy.stop()
@@ -153,7 +154,7 @@ async def test_over_a_narrow_link_a_bound_on_delay_costs_quality(serve: Any, tra
     20 s tells the two apart.
     """
     async with asyncio.timeout(20), serve() as server:
-        proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=20e3, delay_ms=1.0))
+        proxy = LinkProxy(LinkSettings(str(server.address), uplink_bps=20e3, delay_ms=1.0))
         await proxy.start()
         free, bound = [
             (await travel(proxy.address, crf=10.0, max_delay_ms=max_delay_ms)).lines

@@ -11,7 +11,8 @@ import pytest
 from rfcore.codec.h264.config import CoderSettings
 from rfcore.dataset import read_dataset
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.link.proxy import LinkProxy, ProxySettings
+from rfedge.link import LinkSettings
+from rfedge.link.proxy import LinkProxy
 from rfedge.samples import sample_path
 from rfedge.sizing.estimate import Demand, estimate
 from rfedge.sizing.tables import shipped_tables
@@ -43,7 +44,7 @@ async def test_four_cameras_take_of_a_shaped_link_what_is_told(
     drive = sample_path("street/transforms_drive_vehicles.json")
     async with serve(fields=fields, record=tmp_path / "recorded") as server:
         field_id = server._index.ids()[0]
-        proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=LINK_BPS, delay_ms=20.0))
+        proxy = LinkProxy(LinkSettings(str(server.address), uplink_bps=LINK_BPS, delay_ms=20.0))
         await proxy.start()
         records = await asyncio.gather(
             *(

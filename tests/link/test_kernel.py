@@ -23,7 +23,8 @@ import pytest
 from namespaces import Wire, connected, require, run, within
 from rfcore.link.plan import Arrival, delivery_times
 from rfcore.link.shaper import LinkProfile
-from rfedge.link.proxy import LinkProxy, ProxySettings
+from rfedge.link import LinkSettings
+from rfedge.link.proxy import LinkProxy
 
 pytestmark = [pytest.mark.slow, pytest.mark.netns]
 
@@ -180,7 +181,7 @@ async def _through_proxy(size_bytes: int) -> float:
 
     server = await asyncio.start_server(sink, "127.0.0.1", 0)
     address = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
-    proxy = LinkProxy(ProxySettings(address, uplink_bps=RATE_BPS, delay_ms=0.0))
+    proxy = LinkProxy(LinkSettings(address, uplink_bps=RATE_BPS, delay_ms=0.0))
     await proxy.start()
     _, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
     begin_s = loop.time()

@@ -13,8 +13,9 @@ import pytest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.link.plan import DirectionPlan
 from rfcore.link.shaper import LinkProfile
-from rfedge.link.direction import Direction
-from rfedge.link.proxy import LinkProxy, ProxySettings, Side
+from rfedge.link import LinkSettings
+from rfedge.link.direction import Direction, Side
+from rfedge.link.proxy import LinkProxy
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 FAST: dict[str, float] = {"uplink_bps": 1e9, "downlink_bps": 1e9, "delay_ms": 0.0}
@@ -34,7 +35,7 @@ async def linked(handler: Handler, **changes: Any) -> AsyncIterator[LinkProxy]:
     server = await asyncio.start_server(handler, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
     link = changes if "profile" in changes else FAST | changes
-    proxy = LinkProxy(ProxySettings(f"127.0.0.1:{port}", **link))
+    proxy = LinkProxy(LinkSettings(f"127.0.0.1:{port}", **link))
     await proxy.start()
     try:
         yield proxy
@@ -103,7 +104,7 @@ async def test_the_reports_are_written_whole(tmp_path: Path) -> None:
 
 
 async def test_a_connection_is_refused_while_the_server_is_away() -> None:
-    proxy = LinkProxy(ProxySettings("127.0.0.1:1"))
+    proxy = LinkProxy(LinkSettings("127.0.0.1:1"))
     await proxy.start()
     with pytest.raises(ConnectionError):
         await exchange(proxy, b"hello")
@@ -145,7 +146,7 @@ async def test_an_end_that_vanished_unheard_leaves_the_link_to_the_others() -> N
 
 async def test_a_taken_port_is_one_clear_error() -> None:
     async with linked(echo) as proxy:
-        again = ProxySettings("127.0.0.1:1", listen=str(proxy.address))
+        again = LinkSettings("127.0.0.1:1", listen=str(proxy.address))
         with pytest.raises(RfedgeError, match=r"cannot listen on 127\.0\.0\.1:"):
             await LinkProxy(again).start()
 
@@ -161,12 +162,12 @@ async def test_a_taken_port_is_one_clear_error() -> None:
 )
 def test_addresses_are_checked_by_name(listen: str, to: str, named: str) -> None:
     with pytest.raises(InvalidInput) as caught:
-        ProxySettings(to, listen)
+        LinkSettings(to, listen).check()
     assert str(caught.value).startswith(named)
 
 
 def test_another_machine_is_reached_when_plaintext_is_allowed() -> None:
-    ProxySettings("example.org:1", "0.0.0.0:1", allow_insecure=True)
+    LinkSettings("example.org:1", "0.0.0.0:1", allow_insecure=True).check()
 
 
 async def test_a_profile_s_outage_holds_what_comes_during_it(profile: Callable[..., Path]) -> None:
@@ -209,7 +210,7 @@ async def test_the_metrics_of_the_link_are_what_its_report_says() -> None:
 
 def test_a_rate_beside_a_profile_is_refused(profile: Callable[..., Path]) -> None:
     with pytest.raises(InvalidInput, match="uplink_bps: is given beside the profile"):
-        ProxySettings("127.0.0.1:1", uplink_bps=1e6, profile=profile())
+        LinkSettings("127.0.0.1:1", uplink_bps=1e6, profile=profile()).check()
 
 
 async def test_two_paths_share_one_link() -> None:
@@ -231,4 +232,4 @@ async def test_two_paths_share_one_link() -> None:
 
 def test_a_path_needs_both_its_ends() -> None:
     with pytest.raises(InvalidInput, match="HOST:PORT"):
-        ProxySettings("127.0.0.1:1", also=("127.0.0.1:2",))
+        LinkSettings("127.0.0.1:1", also=("127.0.0.1:2",)).check()
