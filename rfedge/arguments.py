@@ -16,8 +16,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
@@ -28,6 +29,7 @@ from rfedge.samples import sample_path
 if TYPE_CHECKING:
     from rfcore.field import RadianceField, SplatField
     from rfcore.wire.nats import NatsServers
+    from rfcore.wire.tls import TlsFiles
 
 __all__ = [
     "ADDRESS",
@@ -42,11 +44,11 @@ __all__ = [
     "SAMPLES",
     "SIZE",
     "SPLATS",
+    "TwinConnection",
     "check_folder",
     "field_path",
     "is_field_file",
     "max_field_bytes",
-    "nats_servers",
     "open_field",
     "open_splats",
     "parse_size",
@@ -171,17 +173,36 @@ def time_text(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def nats_servers(
-    urls: str,
-    login: Path | None,
-    authority: Path | None,
-    certificate: Path | None,
-    key: Path | None,
-    *,
-    allow_insecure: bool,
-) -> NatsServers:
-    """Return the NATS servers that a consumer's options name; raise ``InvalidInput``."""
-    from rfcore.wire.nats import NatsServers
+PEM = arg(metavar="FILE.pem")
 
-    parsed = NatsServers.parse_urls(urls)
-    return NatsServers(parsed, login, authority, certificate, key, allow_insecure)
+
+@dataclass(frozen=True)
+class TwinConnection:
+    """How a consumer of the twin reaches one server, or the NATS of all servers."""
+
+    nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
+    """Show what all servers publish over this NATS (docs/how-to/servers.md), instead of one
+    server."""
+    nats_login: Annotated[Path | None, arg(metavar="FILE")] = None
+    """With --nats: file of one line, USER:PASSWORD or a token."""
+    tls_cert: Annotated[Path | None, PEM] = None
+    """Certificate of this consumer (PEM), for a server or a NATS that wants one."""
+    tls_key: Annotated[Path | None, PEM] = None
+    """Its private key."""
+    tls_ca: Annotated[Path | None, PEM] = None
+    """Certificate of the authority that vouches for the other end."""
+    allow_insecure: bool = False
+    """Watch a server on another machine in plaintext."""
+
+    def nats_servers(self, urls: str) -> NatsServers:
+        """Return the NATS servers of the options; raise ``InvalidInput``."""
+        from rfcore.wire.nats import NatsServers
+
+        parsed, tls = NatsServers.parse_urls(urls), (self.tls_ca, self.tls_cert, self.tls_key)
+        return NatsServers(parsed, self.nats_login, *tls, self.allow_insecure)
+
+    def tls(self) -> TlsFiles | None:
+        """Return the files of a connection with TLS, or None; raise ``InvalidInput``."""
+        from rfcore.wire.tls import TlsFiles
+
+        return TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca)

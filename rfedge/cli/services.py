@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
-from rfedge.arguments import ADDRESS, FOLDER
-
-if TYPE_CHECKING:
-    from rfcore.wire.twin_client import TwinClient
-    from rfedge.watch import PictureSource
+from rfedge.arguments import ADDRESS, FOLDER, TwinConnection
 
 __all__ = ["Certs", "CertsInit", "CertsShow", "Watch"]
-
-PEM = arg(metavar="FILE.pem")
 
 
 @dataclass(frozen=True)
@@ -25,11 +19,6 @@ class Watch:
 
     address: Annotated[str | None, Positional, ADDRESS] = None
     """Where mec-server listens."""
-    nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
-    """Watch what all servers publish over this NATS (docs/how-to/servers.md), instead of one
-    server."""
-    nats_login: Annotated[Path | None, arg(metavar="FILE")] = None
-    """With --nats: file of one line, USER:PASSWORD or a token."""
     vehicle: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
     """Only these vehicles; default: all."""
     dir: Annotated[Path | None, FOLDER] = None
@@ -40,14 +29,7 @@ class Watch:
     """How pictures travel; default: i420 (exact) for a video, jpeg for a folder, else none."""
     pictures: int | None = None
     """Stop after this many pictures."""
-    tls_cert: Annotated[Path | None, PEM] = None
-    """Certificate of this consumer (PEM), for a server or a NATS that wants one."""
-    tls_key: Annotated[Path | None, PEM] = None
-    """Its private key."""
-    tls_ca: Annotated[Path | None, PEM] = None
-    """Certificate of the authority that vouches for the other end."""
-    allow_insecure: bool = False
-    """Watch a server on another machine in plaintext."""
+    connection: OmitArgPrefixes[TwinConnection] = TwinConnection()
 
     def run(self) -> None:
         """Watch until the server ends the stream, enough was seen, SIGINT or SIGTERM."""
@@ -61,29 +43,19 @@ class Watch:
             encoding=self.encoding,
             pictures=self.pictures,
         )
-        if (self.address is None) == (self.nats is None):
+        urls = self.connection.nats
+        if (self.address is None) == (urls is None):
             raise InvalidInput("address", "give one: HOST:PORT of a server, or --nats URL")
-        if self.address is None:
-            watch_until_stopped(settings, self._servers_on_nats())
-            return
-        with self._client(self.address) as client:
-            watch_until_stopped(settings, client)
+        if urls is not None:
+            from rfedge.twin.nats_source import NatsPictures
 
-    def _client(self, address: str) -> TwinClient:
-        from rfcore.wire.tls import TlsFiles
+            watch_until_stopped(settings, NatsPictures(self.connection.nats_servers(urls)))
+            return
         from rfcore.wire.twin_client import TwinClient
 
-        tls = TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca)
-        return TwinClient(address, tls, allow_insecure=self.allow_insecure)
-
-    def _servers_on_nats(self) -> PictureSource:
-        from rfedge.arguments import nats_servers
-        from rfedge.twin.nats_source import NatsPictures
-
-        files = (self.nats_login, self.tls_ca, self.tls_cert, self.tls_key)
-        return NatsPictures(
-            nats_servers(self.nats or "", *files, allow_insecure=self.allow_insecure)
-        )
+        tls, allow_insecure = self.connection.tls(), self.connection.allow_insecure
+        with TwinClient(self.address or "", tls, allow_insecure=allow_insecure) as client:
+            watch_until_stopped(settings, client)
 
 
 @dataclass(frozen=True)

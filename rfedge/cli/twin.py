@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from rfedge.arguments import ADDRESS, DATASET, FOLDER
+from rfedge.arguments import ADDRESS, DATASET, FOLDER, TwinConnection
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Twin"]
 
-PEM = arg(metavar="FILE.pem")
-
 
 @dataclass(frozen=True)
 class Twin:
@@ -29,11 +27,6 @@ class Twin:
 
     target: Annotated[str | None, Positional, arg(metavar="HOST:PORT|FIELD")] = None
     """Address of a mec-server; or a field (archive, name, .ply, .spz) to look at without one."""
-    nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
-    """Show what all servers publish over this NATS (docs/how-to/servers.md), instead of one
-    server."""
-    nats_login: Annotated[Path | None, arg(metavar="FILE")] = None
-    """With --nats: file of one line, USER:PASSWORD or a token."""
     http: Annotated[str, ADDRESS] = "127.0.0.1:8080"
     """Address to serve the page at; port 0 takes a free one. For browsers elsewhere give a
     token."""
@@ -52,14 +45,7 @@ class Twin:
     """Threads that render a field for comparison."""
     fields: Annotated[Path, FOLDER] = Path("out/twin/fields")
     """Folder for fields of servers."""
-    tls_cert: Annotated[Path | None, PEM] = None
-    """Certificate of this consumer (PEM), for a server or a NATS that wants one."""
-    tls_key: Annotated[Path | None, PEM] = None
-    """Its private key."""
-    tls_ca: Annotated[Path | None, PEM] = None
-    """Certificate of the authority that vouches for the other end."""
-    allow_insecure: bool = False
-    """Watch a server on another machine in plaintext."""
+    connection: OmitArgPrefixes[TwinConnection] = TwinConnection()
     ready_file: Annotated[Path | None, arg(metavar="FILE")] = None
     """Write the page's address here once it can be opened."""
 
@@ -75,30 +61,27 @@ class Twin:
     def _source(self) -> Callable[[TwinScene], Source]:
         from rfcore.errors import InvalidInput
 
-        if (self.target is None) == (self.nats is None):
+        if (self.target is None) == (self.connection.nats is None):
             raise InvalidInput("target", "give one: a server, a field, or --nats URL")
         if self.target is None:
-            return self._nats()
+            return self._nats(self.connection.nats or "")
         return self._server(self.target) if _is_address(self.target) else self._field(self.target)
 
-    def _nats(self) -> Callable[[TwinScene], Source]:
-        from rfedge.arguments import nats_servers
+    def _nats(self, urls: str) -> Callable[[TwinScene], Source]:
         from rfedge.twin.nats_source import NatsSource
 
-        files = (self.nats_login, self.tls_ca, self.tls_cert, self.tls_key)
-        servers = nats_servers(self.nats or "", *files, allow_insecure=self.allow_insecure)
+        servers = self.connection.nats_servers(urls)
         return lambda scene: NatsSource(servers, self.fields, scene, self.threads)
 
     def _server(self, address: str) -> Callable[[TwinScene], Source]:
         from rfcore.errors import InvalidInput
-        from rfcore.wire.tls import TlsFiles
         from rfcore.wire.twin_client import AsyncTwinClient
         from rfedge.twin.server_source import ServerSource
 
         if self.drive is not None:
             raise InvalidInput("drive", "belongs to a field; a server shows what vehicles send")
-        tls = TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca)
-        client = AsyncTwinClient(address, tls, allow_insecure=self.allow_insecure)
+        tls, allow_insecure = self.connection.tls(), self.connection.allow_insecure
+        client = AsyncTwinClient(address, tls, allow_insecure=allow_insecure)
         return lambda scene: ServerSource(client, self.fields, scene, self.threads)
 
     def _field(self, target: str) -> Callable[[TwinScene], Source]:

@@ -10,6 +10,7 @@ from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.wire.nats import EXPIRES_S, VehicleLocation, picture_subject
 from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, twin_message_to_wire
+from rfedge.arguments import TwinConnection
 from rfedge.cli.services import Watch
 from rfedge.cli.twin import Twin
 from rfedge.twin.nats_source import SharedTwin, TwinMessage, published_message
@@ -130,8 +131,8 @@ def test_a_message_that_is_none_is_refused(header: str | None, body: bytes | Non
 
 
 @pytest.mark.parametrize("verb", [Twin, Watch])
-@pytest.mark.parametrize("where", [{}, {"nats": "nats://127.0.0.1:1"}])
-def test_one_place_to_look_at_is_asked_for(verb: type[Twin | Watch], where: dict[str, str]) -> None:
-    targets = () if not where else ("127.0.0.1:50051",)
+@pytest.mark.parametrize("nats", [None, "nats://127.0.0.1:1"])
+def test_one_place_to_look_at_is_asked_for(verb: type[Twin | Watch], nats: str | None) -> None:
+    targets = () if nats is None else ("127.0.0.1:50051",)
     with pytest.raises(InvalidInput, match=r"give one: .*--nats URL"):
-        verb(*targets, **where).run()
+        verb(*targets, connection=TwinConnection(nats)).run()
