@@ -72,8 +72,7 @@ class LoadTest:
         from rfcore.errors import InvalidInput, RfedgeError
         from rfcore.wire.settings import RenderSettings
         from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
-        from rfedge.loadtest.result import print_runs, run_loads, write_load_result
-        from rfedge.loadtest.run import TestBed
+        from rfedge.loadtest.run import TestBed, print_runs, run_loads, write_load_result
 
         if not 1 <= self.runs <= 100 or (self.find_limit and self.runs > 1):
             raise InvalidInput("runs", f"{self.runs} is outside 1..100, or beside --find-limit")

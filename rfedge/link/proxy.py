@@ -19,8 +19,10 @@ import os
 import selectors
 import signal
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from prometheus_client import CollectorRegistry
@@ -32,7 +34,7 @@ from rfcore.wire.instruments import MetricsEndpoint
 from rfedge.link import LinkSettings
 from rfedge.link.direction import Direction, LinkMetrics, Side
 
-__all__ = ["LinkProxy", "run_proxy"]
+__all__ = ["LinkProxy", "main", "run_links", "run_proxy"]
 
 SCHEDULERS = {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}
 
@@ -161,10 +163,14 @@ def run_proxy(settings: LinkSettings) -> None:
     """Run the proxy until SIGTERM or SIGINT; raise ``RfedgeError`` if it cannot listen."""
     with suppress(PermissionError):  # the report names the scheduler that was granted
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    # select() sleeps to the microsecond where epoll rounds up to the next millisecond.
-    loop = asyncio.SelectorEventLoop(selectors.SelectSelector())
-    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+    with _runner() as runner:
         runner.run(_run(settings))
+
+
+def _runner() -> asyncio.Runner:
+    """Return a runner that waits by select(): epoll rounds up to the next millisecond."""
+    loop = asyncio.SelectorEventLoop(selectors.SelectSelector())
+    return asyncio.Runner(loop_factory=lambda: loop)
 
 
 async def _run(settings: LinkSettings) -> None:
@@ -179,3 +185,32 @@ async def _run(settings: LinkSettings) -> None:
 
 def _ignore() -> None:
     """Do nothing: the near side reports for both."""
+
+
+async def run_links(profile: Path, count: int, server: str, report: Path, ready: Path) -> None:
+    """Forward over ``count`` links until SIGTERM; ``ready`` gets one address a line."""
+    stopped = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stopped.set)
+    settings = LinkSettings(to=server, profile=profile, spin_s=0.0)
+    proxies = [LinkProxy(settings) for _ in range(count)]
+    addresses = [await proxy.start() for proxy in proxies]
+    write_whole(ready, "".join(f"{address}\n" for address in addresses))
+    await stopped.wait()
+    for proxy in proxies:
+        await proxy.stop()
+    lines = (json.dumps(proxy.report()) + "\n" for proxy in proxies)
+    write_whole(report, "".join(lines))
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run a link for each vehicle of a load test: PROFILE COUNT SERVER REPORT --ready-file FILE.
+
+    The report has one link's measurements a line.
+    """
+    profile, count, server, report, _, ready = arguments
+    with _runner() as runner:
+        runner.run(run_links(Path(profile), int(count), server, Path(report), Path(ready)))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

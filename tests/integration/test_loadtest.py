@@ -17,8 +17,7 @@ from rfcore.wire.settings import RenderSettings
 from rfedge.loadtest.fleet import Departure, FleetSpec, run_fleet
 from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
-from rfedge.loadtest.result import run_loads, write_load_result
-from rfedge.loadtest.run import TestBed
+from rfedge.loadtest.run import TestBed, run_loads, write_load_result
 from rfedge.loadtest.server import KeptRenders, passing, with_kept_renders
 
 PATIENT = Bounds(deadline_ms=60_000.0, on_time_percent=0.0, fairness=0.0, settling_mb=1e6)

@@ -9,8 +9,7 @@ from lab.pages.loads import RecordedLoad, main, record
 from load_runs import load_run
 from rfcore.errors import InvalidInput
 from rfedge.loadtest.plan import Mode
-from rfedge.loadtest.result import LoadResult, write_load_result
-from rfedge.loadtest.run import Run
+from rfedge.loadtest.run import LoadResult, Run, write_load_result
 from rfedge.results import Provenance, make_result, read_result, rows_of, write_result
 
 

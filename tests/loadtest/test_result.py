@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from load_runs import load_run
-from rfedge.loadtest.result import (
+from rfedge.loadtest.run import (
     LoadResult,
+    LoadRow,
     largest_held,
     latency_chart,
     print_runs,
     write_load_result,
 )
-from rfedge.loadtest.run import LoadRow
 from rfedge.results import read_result, rows_of
 
 # --- the search
