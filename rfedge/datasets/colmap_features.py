@@ -28,7 +28,6 @@ with needs("colmap"):
     import pycolmap
 
 __all__ = [
-    "ColmapWorkspace",
     "PoseSettings",
     "add_known",
     "add_new",
@@ -42,6 +41,9 @@ __all__ = [
 
 
 T = TypeVar("T")
+
+DATABASE = "database.db"
+"""COLMAP's SQLite file, in the folder of the pictures."""
 
 
 @dataclass(frozen=True)
@@ -106,48 +108,34 @@ def pose_from_colmap(cam_from_world: pycolmap.Rigid3d) -> Pose:
     return Pose.from_matrix(cam_from_world.matrix().tolist()).inverse()
 
 
-@dataclass(frozen=True)
-class ColmapWorkspace:
-    """A folder with the pictures and the database."""
-
-    root: Path
-
-    @property
-    def database(self) -> Path:
-        """COLMAP's SQLite file."""
-        return self.root / "database.db"
-
-
-def add_known(
-    workspace: ColmapWorkspace, known: Sequence[SourcePicture], settings: PoseSettings
-) -> None:
+def add_known(root: Path, known: Sequence[SourcePicture], settings: PoseSettings) -> None:
     """Add a dataset's pictures with their own cameras, as ``known/000000.png`` and so on."""
-    (workspace.root / "known").mkdir()
+    (root / "known").mkdir()
     groups: dict[SourceCamera, list[str]] = {}
     for i, picture in enumerate(known):
         name = f"known/{i:06d}.png"
-        write_png(workspace.root / name, picture.read())
+        write_png(root / name, picture.read())
         groups.setdefault(picture.camera, []).append(name)
     for camera, names in groups.items():
         options = pycolmap.ImageReaderOptions()
         options.camera_model, parameters = camera_parameters(camera)
         options.camera_params = ",".join(repr(float(value)) for value in parameters)
-        _extract(workspace, names, options, settings)
+        _extract(root, names, options, settings)
 
 
-def add_new(workspace: ColmapWorkspace, names: Sequence[str], settings: PoseSettings) -> None:
+def add_new(root: Path, names: Sequence[str], settings: PoseSettings) -> None:
     """Add the new pictures: with the dataset's camera, or with one that is to be estimated."""
     options = pycolmap.ImageReaderOptions()
     options.camera_model = settings.model
     options.camera_params = ",".join(map(repr, settings.parameters))
-    with pycolmap.Database.open(workspace.database) as database:
+    with pycolmap.Database.open(root / DATABASE) as database:
         cameras = database.read_all_cameras()
     if cameras and settings.camera == "dataset":
-        options.existing_camera_id = _shared_camera(workspace, names, cameras)
-    _extract(workspace, names, options, settings)
+        options.existing_camera_id = _shared_camera(root, names, cameras)
+    _extract(root, names, options, settings)
 
 
-def match(workspace: ColmapWorkspace, settings: PoseSettings) -> None:
+def match(root: Path, settings: PoseSettings) -> None:
     """Match features and keep what two-view geometry confirms."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, settings.threads
@@ -158,7 +146,7 @@ def match(workspace: ColmapWorkspace, settings: PoseSettings) -> None:
         run = pycolmap.match_sequential if sequential else pycolmap.match_exhaustive
         run(*arguments, **named)
 
-    cancellable(seeded, workspace.database, options, device=pycolmap.Device.cpu)
+    cancellable(seeded, root / DATABASE, options, device=pycolmap.Device.cpu)
 
 
 def cancellable(call: Callable[..., T], *arguments: Any, **named: Any) -> T:
@@ -177,16 +165,14 @@ def cancellable(call: Callable[..., T], *arguments: Any, **named: Any) -> T:
             raise
 
 
-def _shared_camera(
-    workspace: ColmapWorkspace, names: Sequence[str], cameras: Sequence[pycolmap.Camera]
-) -> int:
+def _shared_camera(root: Path, names: Sequence[str], cameras: Sequence[pycolmap.Camera]) -> int:
     if len(cameras) > 1:
         raise DatasetError(
             f"the dataset has {len(cameras)} cameras; choose --camera estimate for new pictures"
         )
     size_px = (cameras[0].width, cameras[0].height)
     for name in names:
-        found = picture_size_px(workspace.root / name)
+        found = picture_size_px(root / name)
         if found != size_px:
             raise DatasetError(
                 f"{Path(name).name}: {found} px is not the {size_px} px of the dataset's camera; "
@@ -196,7 +182,7 @@ def _shared_camera(
 
 
 def _extract(
-    workspace: ColmapWorkspace,
+    root: Path,
     names: Sequence[str],
     reader: pycolmap.ImageReaderOptions,
     settings: PoseSettings,
@@ -207,8 +193,8 @@ def _extract(
     options.sift.max_num_features = settings.features
     cancellable(
         pycolmap.extract_features,
-        workspace.database,
-        workspace.root,
+        root / DATABASE,
+        root,
         list(names),
         pycolmap.CameraMode.SINGLE,
         reader,

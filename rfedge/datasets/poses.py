@@ -25,7 +25,7 @@ from rfcore.errors import DatasetError
 from rfcore.extras import needs
 from rfcore.files import whole_folder
 from rfedge.datasets.colmap_features import (
-    ColmapWorkspace,
+    DATABASE,
     PoseSettings,
     add_known,
     add_new,
@@ -48,16 +48,12 @@ ANY_FORWARD_MOTION = 1.0
 """A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
 
 
-def _ignore(_: str) -> None:
-    """Do nothing with a line of progress."""
-
-
 def pose_dataset(
     images: Path,
     out: Path,
     register_to: Path | None,
     settings: PoseSettings,
-    tell: Tell = _ignore,
+    tell: Tell,
 ) -> str:
     """Write ``out`` with the pictures that could be placed; return one line about it.
 
@@ -132,20 +128,19 @@ def solve_poses(
     Raises ``DatasetError`` when fewer than two pictures, or none of the new ones, can be placed.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    workspace = ColmapWorkspace(root)
     origin = chosen_origin(known) if known else TileOrigin()
     if known:
         tell(f"features of the dataset's {len(known)} pictures")
-        add_known(workspace, known, settings)
+        add_known(root, known, settings)
     tell(f"features of {len(names)} new pictures")
-    add_new(workspace, names, settings)
+    add_new(root, names, settings)
     tell(f"matching {len(known) + len(names)} pictures ({settings.matching})")
-    match(workspace, settings)
+    match(root, settings)
     placing = _PlacingProgress(tell, len(known) + len(names))
     if known:
-        model = _registered(workspace, known, origin, settings, placing)
+        model = _registered(root, known, origin, settings, placing)
     else:
-        model = _alone(workspace, settings, placing)
+        model = _alone(root, settings, placing)
     return _solution(model, names, origin)
 
 
@@ -167,17 +162,17 @@ class _PlacingProgress:
 
 
 def _alone(
-    workspace: ColmapWorkspace, settings: PoseSettings, placing: _PlacingProgress
+    root: Path, settings: PoseSettings, placing: _PlacingProgress
 ) -> pycolmap.Reconstruction:
-    folder = workspace.root / "model"
+    folder = root / "model"
     folder.mkdir()
     options = _options(settings)
     options.ba_refine_focal_length = options.ba_refine_extra_params = not settings.parameters
     options.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
     models = cancellable(
         pycolmap.incremental_mapping,
-        workspace.database,
-        workspace.root,
+        root / DATABASE,
+        root,
         folder,
         options,
         initial_image_pair_callback=lambda: placing.start_from(2),
@@ -189,13 +184,13 @@ def _alone(
 
 
 def _registered(
-    workspace: ColmapWorkspace,
+    root: Path,
     known: Sequence[SourcePicture],
     origin: TileOrigin,
     settings: PoseSettings,
     placing: _PlacingProgress,
 ) -> pycolmap.Reconstruction:
-    given = _given_poses(workspace, known, origin)
+    given = _given_poses(root, known, origin)
     held = set(given.cameras)
     options = _options(settings)
     options.fix_existing_frames = True
@@ -203,26 +198,26 @@ def _registered(
     if settings.camera == "dataset" or settings.parameters:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
     for name in ("given", "model"):
-        (workspace.root / name).mkdir()
+        (root / name).mkdir()
     placing.tell("points of the dataset's pictures at their given poses")
     placing.start_from(len(known))
     cancellable(
         pycolmap.triangulate_points,
         given,
-        workspace.database,
-        workspace.root,
-        workspace.root / "given",
+        root / DATABASE,
+        root,
+        root / "given",
         True,
         options,
         False,
     )
     models = cancellable(
         pycolmap.incremental_mapping,
-        workspace.database,
-        workspace.root,
-        workspace.root / "model",
+        root / DATABASE,
+        root,
+        root / "model",
         options,
-        workspace.root / "given",
+        root / "given",
         next_image_callback=placing.one_more,
     )
     if not models:
@@ -231,11 +226,11 @@ def _registered(
 
 
 def _given_poses(
-    workspace: ColmapWorkspace, known: Sequence[SourcePicture], origin: TileOrigin
+    root: Path, known: Sequence[SourcePicture], origin: TileOrigin
 ) -> pycolmap.Reconstruction:
     """Return the dataset's cameras and poses under the ids the database gave them."""
     model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(workspace.database) as database:
+    with pycolmap.Database.open(root / DATABASE) as database:
         cameras, images = database.read_all_cameras(), database.read_all_images()
     poses = {f"known/{i:06d}.png": picture.world_from_cam for i, picture in enumerate(known)}
     given = [image for image in images if image.name in poses]

@@ -101,7 +101,7 @@ def test_a_drive_alone_finds_how_the_camera_turns(drive, tmp_path):
         features=2048,
         threads=1,
     )
-    pose_dataset(tmp_path / "images", tmp_path / "out", None, known)
+    pose_dataset(tmp_path / "images", tmp_path / "out", None, known, lambda _: None)
     found = read_source(tmp_path / "out").pictures
     assert len(found) == len(drive)
     assert found[0].camera == drive[0].camera
@@ -155,7 +155,7 @@ def test_parameters_belong_to_their_model():
 
 def test_too_few_pictures_are_refused(tmp_path):
     with pytest.raises(DatasetError, match="holds 0 pictures"):
-        pose_dataset(tmp_path, tmp_path / "out", None, SETTINGS)
+        pose_dataset(tmp_path, tmp_path / "out", None, SETTINGS, lambda _: None)
 
 
 @pytest.mark.parametrize("folder", [False, True])
@@ -163,7 +163,9 @@ def test_a_video_is_refused_with_the_commands_that_help(tmp_path, folder):
     video = tmp_path / "phone.MOV"
     video.write_bytes(b"\0\0\0 ftypqt")
     with pytest.raises(DatasetError, match=r"phone\.MOV: is a video.*rfedge dataset poses"):
-        pose_dataset(tmp_path if folder else video, tmp_path / "out", None, SETTINGS)
+        pose_dataset(
+            tmp_path if folder else video, tmp_path / "out", None, SETTINGS, lambda _: None
+        )
     assert not (tmp_path / "out").exists()
 
 
@@ -174,6 +176,6 @@ def test_pictures_that_share_nothing_leave_nothing_behind(tmp_path):
         rgb = np.random.default_rng(i).integers(0, 256, (48, 64, 3), dtype=np.uint8)
         write_png(images / f"{i}.png", rgb)
     with pytest.raises(DatasetError, match="no two pictures share enough"):
-        pose_dataset(images, tmp_path / "out", None, SETTINGS)
+        pose_dataset(images, tmp_path / "out", None, SETTINGS, lambda _: None)
     shutil.rmtree(images)
     assert list(tmp_path.iterdir()) == []
