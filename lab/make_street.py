@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import tyro
 from tyro.conf import Positional
 
@@ -23,14 +24,10 @@ from rfcore.dataset.read import read_source
 from rfcore.dataset.source import Source
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
 from rfcore.errors import DatasetError
-from rfcore.extras import needs
 from rfcore.files import write_whole
 from rfcore.image import Rgb
 from rfedge.program import run_program
 from rfedge.samples import sample_path
-
-with needs("scene"):
-    import cv2
 
 COMMAND = "make sample"
 

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Pose
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
-from rfcore.extras import needs
 from rfcore.image import Rgb
 from rfcore.views import PosedPicture
 from streetgen.assembly import world_of
@@ -27,9 +27,6 @@ from streetgen.geometry.world import World
 from streetgen.render.backend import chosen_backend
 from streetgen.render.renderer import PathTracer, Sampling
 from streetgen.scene_file import load_scene
-
-with needs("scene"):
-    import cv2
 
 F64 = NDArray[np.float64]
 SAMPLED = 4
