@@ -263,8 +263,8 @@ def test_the_twin_has_a_certificate_of_its_own_and_a_token():
     verb = verb_of("twin")
     init = verb_of("certificates")
     assert verb.target == f"{running('mec-server')[0]}:50051"
-    assert verb.tls_key.stem.removeprefix("consumer-") in init.verb.consumers
-    assert verb.tls_key.name not in " ".join(command("watch")), "a key is one service's"
+    assert verb.connection.tls_key.stem.removeprefix("consumer-") in init.verb.consumers
+    assert verb.connection.tls_key.name not in " ".join(command("watch")), "a key is one service's"
     token = filled(SERVICES["twin"]["environment"]["RFEDGE_TWIN_TOKEN"])
     WebSettings(Address.parse("http", verb.http), token)
     (port,) = SERVICES["twin"]["ports"]
