@@ -14,8 +14,6 @@ from cav_agent.vehicle import Vehicle
 from rfcore.errors import RfedgeError
 from rfcore.wire.settings import OPTIONS, configure_logs
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Parse the command line and drive; exit 2 with one line when it cannot be done."""

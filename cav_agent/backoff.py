@@ -12,8 +12,6 @@ from collections.abc import Callable
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["Backoff"]
-
 
 class Backoff:
     """Pauses between tries; ``chance`` returns numbers of 0..1, evenly distributed."""

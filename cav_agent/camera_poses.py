@@ -19,20 +19,6 @@ from rfcore.localise.estimate import LocalisationState, PoseEstimate, PoseMeasur
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.views import FieldView
 
-__all__ = [
-    "CameraLocation",
-    "CameraPoses",
-    "DatasetPoses",
-    "KnownPoses",
-    "MeasuredRigPoses",
-    "PoseSource",
-    "RecordedRigPoses",
-    "RigCameraPoses",
-    "RigPose",
-    "RigPoses",
-    "TrackedRigPoses",
-]
-
 NS = 1_000_000_000
 
 STAND_IN_STD_M, STAND_IN_STD_DEG = 0.5, 1.0

@@ -23,15 +23,6 @@ from rfcore.dataset.rig import RigCamera, RigInstant, read_rig, read_rig_drive
 from rfcore.errors import InvalidInput
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "Position",
-    "RecordedCameras",
-    "VehicleCamera",
-    "VehicleCameras",
-    "instant_numbers",
-    "recorded_cameras",
-]
-
 Position = tuple[float, float]
 """(east, north) in metres, in the drive's own global frame."""
 

@@ -15,16 +15,6 @@ from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.frames import EndReason, FrameResult, Outcome
 from rfcore.errors import InvalidInput, RfedgeError
 
-__all__ = [
-    "MAX_TRIES",
-    "ROUNDING_S",
-    "CaptureSchedule",
-    "Lockstep",
-    "RateLimit",
-    "Realtime",
-    "recorded_schedule",
-]
-
 ROUNDING_S = 1e-6
 """Tolerance for the rounding error of summed periods."""
 

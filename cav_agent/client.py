@@ -39,14 +39,6 @@ from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import FieldNotice, Welcome
 from rfcore.wire.notices import StreetNotice
 
-__all__ = [
-    "CameraSource",
-    "CameraTaken",
-    "FieldNotServed",
-    "StreamClient",
-    "StreamOwner",
-]
-
 log = structlog.get_logger()
 Stream = grpc.aio.StreamStreamCall[bytes, bytes]
 

@@ -17,8 +17,6 @@ from rfcore.errors import InvalidInput
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
 from rfcore.wire.values import check_field_id, check_name
 
-__all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
-
 
 @dataclass(frozen=True)
 class AgentLimits:

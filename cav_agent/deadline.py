@@ -21,14 +21,6 @@ from typing import Protocol
 from rfcore.codec.sender.ladder import MeasuredRung, Rung
 from rfcore.errors import InvalidInput
 
-__all__ = [
-    "DeadlineController",
-    "DeadlineRungs",
-    "FixedRung",
-    "Rungs",
-    "Step",
-]
-
 ROOM = 0.85
 """Share of the deadline that a better rung must be predicted to stay below."""
 

@@ -34,13 +34,6 @@ from rfcore.field import FULL, FieldStore, RadianceField
 from rfcore.field.store import decode_beginning
 from rfcore.wire.tiles import Tile
 
-__all__ = [
-    "SHIPPED_LADDER",
-    "FieldCache",
-    "PreparedCamera",
-    "PreparedField",
-]
-
 log = structlog.get_logger()
 
 SHIPPED_LADDER = Path(__file__).with_name("ladder.json")

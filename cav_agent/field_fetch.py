@@ -30,8 +30,6 @@ from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 if TYPE_CHECKING:
     from rfcore.wire.v1.field_pb2_grpc import FieldServiceAsyncStub
 
-__all__ = ["MAX_FIELD_BYTES", "Beginnings", "fetch_field"]
-
 log = structlog.get_logger()
 
 Metadata = tuple[tuple[str, str], ...]

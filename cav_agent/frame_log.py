@@ -24,8 +24,6 @@ from rfcore.wire.address import Address
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.values import ClockKind
 
-__all__ = ["DriveObserver", "log_line"]
-
 log = structlog.get_logger()
 
 LOGGED_CRF = 4.0

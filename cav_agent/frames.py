@@ -20,17 +20,6 @@ from rfcore.views import PosedPicture
 from rfcore.wire.messages import FrameAddress, StageTimes
 from rfcore.wire.values import ClockKind
 
-__all__ = [
-    "Capture",
-    "EncodeJob",
-    "EncodedFrame",
-    "EndReason",
-    "FrameResult",
-    "Outcome",
-    "RetryReason",
-    "StreamEnd",
-]
-
 
 @dataclass(frozen=True)
 class Capture:

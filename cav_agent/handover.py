@@ -21,8 +21,6 @@ from cav_agent.cameras import Position
 from rfcore.errors import InvalidInput
 from rfcore.wire.tiles import Tile
 
-__all__ = ["LEAVE_SHARE", "LOST_AFTER_S", "Handover", "HandoverCause", "ServedTile", "TileRoute"]
-
 LEAVE_SHARE = 0.25
 """Share of a tile's margin that a vehicle drives into before another tile takes over."""
 

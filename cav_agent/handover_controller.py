@@ -33,8 +33,6 @@ from cav_agent.frames import FrameResult, RetryReason
 from cav_agent.handover import LOST_AFTER_S, Handover, ServedTile, TileRoute
 from rfcore.errors import ProtocolError, RfedgeError
 
-__all__ = ["HandoverController", "OpenStream", "PrepareStream", "TileStream"]
-
 log = structlog.get_logger()
 
 NEAR_S, NEAR_PICTURES = 2.0, 3

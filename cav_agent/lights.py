@@ -26,8 +26,6 @@ from rfcore.field import Quality, RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.views import FieldView, View
 
-__all__ = ["TileLights"]
-
 log = structlog.get_logger()
 
 FITS_LEVELS = 6.0

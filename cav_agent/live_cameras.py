@@ -36,8 +36,6 @@ from rfcore.image import Rgb
 from rfcore.localise.estimate import PoseMeasurement
 from rfcore.views import PosedPicture
 
-__all__ = ["InstantClock", "LiveCameras", "LiveSchedule", "TrajectoryPoses", "open_live_cameras"]
-
 SILENT_PERIODS = 3.0
 """A camera that gave no frame for so many periods is not waited for."""
 NOWHERE: tuple[Position, ...] = ((0.0, 0.0),)

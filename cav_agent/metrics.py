@@ -16,8 +16,6 @@ from rfcore.localise.estimate import LocalisationState, PoseEstimate
 from rfcore.wire.instruments import Instruments
 from rfcore.wire.notices import NOTICE_KINDS
 
-__all__ = ["AgentMetrics"]
-
 
 class AgentMetrics:
     """Counters, gauges and histograms on one registry."""

@@ -31,8 +31,6 @@ import structlog
 from rfcore.errors import InvalidInput
 from rfcore.wire.notices import StreetNotice
 
-__all__ = ["NoticeSocket", "notice_line"]
-
 log = structlog.get_logger()
 
 MAX_UNREAD_BYTES = 64 << 10

@@ -23,8 +23,6 @@ from dataclasses import dataclass
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["MIN_RTT_WINDOW_NS", "PathEstimator"]
-
 FIRST_NS_PER_BYTE = 8_000.0
 """Before the first answer: 1 Mbit/s, which every access network that carries video has."""
 

@@ -28,15 +28,6 @@ from cav_agent.frames import Capture, FrameResult
 from rfcore.errors import RejectReason
 from rfcore.wire.messages import Ack, FrameAddress, Nack
 
-__all__ = [
-    "SLOWEST_BPS",
-    "AnswerTimeout",
-    "FrameInFlight",
-    "FramesInFlight",
-    "PredictionChain",
-    "WaitingInstants",
-]
-
 SLOWEST_BPS = 0.3e6
 """A link that has collapsed to this rate still counts as one."""
 

@@ -32,8 +32,6 @@ from rfcore.views import FieldView, PosedPicture
 from rfcore.wire.messages import FrameAddress
 from rfcore.wire.values import MAX_PAYLOAD_BYTES
 
-__all__ = ["Pipeline", "PipelineOptions"]
-
 ClockNs = Callable[[], int]
 
 

@@ -31,8 +31,6 @@ from cav_agent.path_estimator import PathEstimator
 from rfcore.errors import InvalidInput
 from rfcore.wire.messages import FrameAddress
 
-__all__ = ["LEAST_CAMERA_SHARE", "BitDivision", "ByteBudget", "RateControl"]
-
 SHARE = 0.75
 """Share of the delay that is aimed at; the rest is a margin for frames, path and machine."""
 

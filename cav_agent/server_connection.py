@@ -22,8 +22,6 @@ from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfcore.wire.values import check_field_id
 
-__all__ = ["WHOLE_STREET", "ServerConnection", "retry_after_s", "server_connections"]
-
 ASK_AFTER_S = 1.0
 """After this time without a connection, the vehicle checks whether the server refuses it."""
 

@@ -51,8 +51,6 @@ from rfcore.wire.messages import (
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.values import FIELD_ID_PREFIX_BYTES, MAX_PAYLOAD_BYTES
 
-__all__ = ["AgentSession", "LinkState", "OutgoingMessage"]
-
 
 class LinkState(StrEnum):
     """The state of the conversation with the server."""

@@ -24,8 +24,6 @@ from rfcore.localise.matching import use_one_thread
 from rfcore.localise.track import TrackingBudget
 from rfcore.localise.tracker import PoseTracker, SearchJob, TimedPose, full_range
 
-__all__ = ["CameraTracking"]
-
 U8 = NDArray[np.uint8]
 SearchResult = tuple[Localised | Lost, TimedPose | None]
 """The end of a search, and the pose of a later picture, if that was searched for."""

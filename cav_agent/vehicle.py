@@ -66,8 +66,6 @@ from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.tiles import Tile
 from rfcore.wire.values import check_name
 
-__all__ = ["SEARCH_NICENESS", "Vehicle", "metric_families", "yield_to_frames"]
-
 SEARCH_NICENESS = 5
 """Niceness of the thread that searches poses. Beside it frames take as long as alone: 25 ms on two
 cores with other work; beside a thread of their own priority they take 45. At 10 they take no less,

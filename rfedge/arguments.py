@@ -31,30 +31,6 @@ if TYPE_CHECKING:
     from rfcore.wire.nats import NatsServers
     from rfcore.wire.tls import TlsFiles
 
-__all__ = [
-    "ADDRESS",
-    "DATASET",
-    "FIELD",
-    "FOLDER",
-    "IMPORTED",
-    "JSON",
-    "PLY",
-    "RENDERER",
-    "RFF",
-    "SAMPLES",
-    "SIZE",
-    "SPLATS",
-    "TwinConnection",
-    "check_folder",
-    "field_path",
-    "is_field_file",
-    "max_field_bytes",
-    "open_field",
-    "open_splats",
-    "parse_size",
-    "time_text",
-]
-
 FIELD = arg(metavar="FIELD")
 """The path of an archive, or the name of a field."""
 DATASET = arg(metavar="DATASET")

@@ -29,17 +29,6 @@ with needs("ops"):
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-__all__ = [
-    "CertificateInfo",
-    "Issued",
-    "Members",
-    "add_certificates",
-    "certify",
-    "read_certificates",
-    "write_certificates",
-]
-
-
 MAX_DAYS = 3650
 BACKDATED = timedelta(hours=1)
 """New certificates are valid from a little earlier, for clients whose clocks are slow."""

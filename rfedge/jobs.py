@@ -41,18 +41,6 @@ from rfcore.extras import needs
 from rfcore.files import write_whole
 from rfcore.wire.address import Address
 
-__all__ = [
-    "Cell",
-    "CellKey",
-    "CellStore",
-    "Job",
-    "Rows",
-    "Tell",
-    "check_processes",
-    "console_of",
-    "run_jobs",
-]
-
 Tell = Callable[[str], None]
 """Takes a line about how a job goes."""
 CellKey = Mapping[str, str | float | int | None]

@@ -19,8 +19,6 @@ from rfcore.localise.estimate import PoseEstimate, PoseMeasurement
 from rfcore.localise.tracker import PoseTracker
 from rfcore.views import FieldView, PosedPicture
 
-__all__ = ["LocatedDrive", "Observation", "TimedFix", "own_poses", "times_of"]
-
 UNTIMED_HZ = 10.0
 """Rate of a drive whose pictures have no times."""
 NS = 1e9

@@ -30,20 +30,6 @@ from rfcore.wire.drive_file import CodedDrive
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 from rfcore.wire.values import MAX_PAYLOAD_BYTES
 
-__all__ = [
-    "Arrival",
-    "CodedFrame",
-    "CodingSettings",
-    "DecodedFrame",
-    "FrameInput",
-    "Locate",
-    "decode_drive",
-    "decode_frames",
-    "decode_promised",
-    "encode_drive",
-    "encode_frames",
-]
-
 OFFLINE_VEHICLE = "offline"
 CAMERA_ID = "front"
 RENDERER = RendererContract(RENDERER_CONTRACT, exact=True)

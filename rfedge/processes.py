@@ -17,8 +17,6 @@ from pathlib import Path
 
 from rfcore.errors import RfedgeError
 
-__all__ = ["Service", "command_of", "run_to_end", "service"]
-
 START_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 10.0
 POLL_S = 0.02

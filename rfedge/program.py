@@ -27,8 +27,6 @@ from tyro.conf import (
 
 from rfcore.errors import RfedgeError
 
-__all__ = ["CONFIG", "SIGPIPE_STATUS", "Verb", "run_program"]
-
 CONFIG = (
     OmitSubcommandPrefixes,
     DisallowNone,

@@ -29,21 +29,6 @@ from typing import Any, TypeVar, cast
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 
-__all__ = [
-    "Provenance",
-    "Result",
-    "as_json",
-    "check_result_path",
-    "host",
-    "make_result",
-    "provenance",
-    "read_result",
-    "revision",
-    "rows_of",
-    "text_of",
-    "write_result",
-]
-
 Result = Mapping[str, Any]
 """The content of a result file, as JSON has it."""
 

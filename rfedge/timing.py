@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from statistics import median
 from time import perf_counter_ns
 
-__all__ = ["REPETITIONS", "median_ms", "medians_ms"]
-
 REPETITIONS = 20
 WARM_UP = 3
 

@@ -12,8 +12,6 @@ import numpy as np
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 
-__all__ = ["write_mp4"]
-
 
 def write_mp4(path: Path, frames: Iterable[Rgb], rate_hz: float) -> int:
     """Write pictures of one size and return how many; an odd last row or column is cut off.

@@ -37,16 +37,6 @@ from rfcore.wire.twin import (
 )
 from rfcore.wire.values import check_name
 
-__all__ = [
-    "PictureFolder",
-    "PictureSource",
-    "PictureVideo",
-    "WatchSettings",
-    "watch",
-    "watch_until_stopped",
-]
-
-
 TICKS_PER_S = 90_000
 """Resolution of a video's times, as in MPEG systems."""
 

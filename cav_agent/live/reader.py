@@ -34,8 +34,6 @@ from cav_agent.live.settings import ReaderSettings, SourceKind
 from rfcore.errors import RfedgeError
 from rfcore.image import Rgb, rgb_from_video_frame
 
-__all__ = ["HEADER_BYTES", "EndRecord", "FrameRecord", "Header", "Record", "main", "record_of"]
-
 NS = 1_000_000_000
 PRODUCER_TIME = struct.Struct("<q")
 """``AVProducerReferenceTime.wallclock``, microseconds of the Unix epoch: from sender reports."""

@@ -25,17 +25,6 @@ from urllib.parse import urlsplit
 
 from rfcore.errors import InvalidInput
 
-__all__ = [
-    "LOW_DELAY",
-    "LiveSettings",
-    "ReaderSettings",
-    "RtspTransport",
-    "SourceAddress",
-    "SourceKind",
-    "parse_address",
-    "without_password",
-]
-
 LOW_DELAY = {"fflags": "nobuffer", "analyzeduration": "500000", "max_delay": "200000"}
 """Microseconds: probe half a second, and wait a fifth of one for RTP packets out of order."""
 RTP_BUFFER_BYTES = 1 << 20

@@ -39,19 +39,6 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import Rgb
 from rfcore.wire.values import ClockKind
 
-__all__ = [
-    "CaptureClock",
-    "Clocks",
-    "LiveFrame",
-    "LiveSource",
-    "Reader",
-    "ReaderProcess",
-    "SourceObserver",
-    "SourceProblem",
-    "SourceThread",
-    "Stamp",
-]
-
 NS = 1_000_000_000
 MAX_APART_NS = 10 * NS
 PATIENCE_NS = 1 * NS

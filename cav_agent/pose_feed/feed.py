@@ -18,8 +18,6 @@ from cav_agent.pose_feed.fix import BadReading, FeedProblem, Fix
 from cav_agent.pose_feed.json_lines import JsonParser
 from cav_agent.pose_feed.nmea import NmeaParser
 
-__all__ = ["FeedChecks", "FeedReader", "PoseFeed", "ProblemLog", "distance_m"]
-
 NS = 1_000_000_000
 MAX_LINE_BYTES = 4096
 """NMEA allows 82, gpsd's reports take up to 1.5 KB."""

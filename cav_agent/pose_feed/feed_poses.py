@@ -34,14 +34,6 @@ from rfcore.field import Bounds
 from rfcore.localise.estimate import PoseMeasurement, PosePrior
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "LONGEST_CARRY_S",
-    "FeedPoses",
-    "TimeOffset",
-    "TimeOffsetEstimator",
-    "recorded_time_ns",
-]
-
 KEPT = 300
 FEWEST = 8
 DETERMINED_S = 0.1

@@ -18,8 +18,6 @@ from rfcore.geodesy import Anchor
 from rfcore.localise.estimate import PoseMeasurement
 from rfcore.motion import quaternion_from_vector
 
-__all__ = ["BadReading", "CameraMount", "FeedProblem", "FieldPlacement", "Fix", "finite"]
-
 Rotation = tuple[float, float, float, float]
 
 

@@ -25,8 +25,6 @@ from typing import Any
 from cav_agent.pose_feed.fix import BadReading, FeedProblem, Fix, finite
 from rfcore.camera import Vec3
 
-__all__ = ["JsonParser"]
-
 KEYS = {
     "time_s", "time", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m", "z_m",
     "heading_deg", "quaternion", "covariance_m2", "rotation_std_deg",

@@ -18,8 +18,6 @@ from cav_agent.pose_feed.fix import BadReading, FeedProblem, Fix, finite
 from rfcore.camera import Vec3
 from rfcore.extras import needs
 
-__all__ = ["NmeaParser"]
-
 KNOT_MPS = 1852 / 3600
 LEAST_SPEED_MPS = 1.5
 """Below this the course over ground says nothing about the heading."""

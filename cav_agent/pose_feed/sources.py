@@ -21,8 +21,6 @@ from cav_agent.pose_feed.feed import PoseFeed
 from cav_agent.pose_feed.fix import CameraMount, FeedProblem
 from rfcore.errors import InvalidInput
 
-__all__ = ["FeedKind", "FeedSource", "FeedTask", "PoseFeedSettings", "parse_source"]
-
 BAUDS = (4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 GPSD_PORT = 2947
 RETRY_S = 1.0

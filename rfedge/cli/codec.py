@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from rfcore.field import RadianceField
     from rfedge.offline import Locate
 
-__all__ = ["Decode", "Encode"]
-
 RFV = arg(metavar="FILE.rfv")
 
 

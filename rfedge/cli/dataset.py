@@ -23,14 +23,6 @@ from rfedge.arguments import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = [
-    "Dataset",
-    "DatasetConvert",
-    "DatasetPoses",
-    "DatasetRecordCarla",
-    "DatasetSplit",
-]
-
 
 @dataclass(frozen=True)
 class DatasetConvert:

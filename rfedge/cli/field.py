@@ -30,16 +30,6 @@ if TYPE_CHECKING:
     from rfcore.views import PosedPicture
     from rfedge.fields.check import Fit
 
-__all__ = [
-    "Field",
-    "FieldAnchor",
-    "FieldCheck",
-    "FieldExport",
-    "FieldImport",
-    "FieldInfo",
-    "FieldSlim",
-]
-
 
 @dataclass(frozen=True)
 class FieldImport:

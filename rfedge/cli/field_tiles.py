@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from rfcore.wire.tiles import Tile
     from rfedge.datasets.convert import SplitTile
 
-__all__ = ["FieldList", "FieldPublish", "FieldRollback"]
-
 DAMAGED, GONE = "damaged", "gone"
 
 

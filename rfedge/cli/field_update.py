@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from rfcore.update.splats import Progress
     from rfedge.jobs import Job, Tell
 
-__all__ = ["FieldDisagree", "FieldUpdate"]
-
 PNG = arg(metavar="FILE.png")
 JOB_BYTES = 2_500_000_000
 

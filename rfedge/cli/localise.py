@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from rfcore.views import PosedPicture
     from rfedge.localisation.searches import RecordedFeed
 
-__all__ = ["Localise"]
-
 
 @dataclass(frozen=True)
 class Localise:

@@ -14,8 +14,6 @@ from rfedge.evaluate.ladder import EvalLadder
 from rfedge.evaluate.never_worse import EvalNeverWorse
 from rfedge.samples import sample_path
 
-__all__ = ["Eval", "LoadTest"]
-
 
 @dataclass(frozen=True)
 class LoadTest:

@@ -10,8 +10,6 @@ from tyro.conf import Positional, arg
 
 from rfedge.arguments import DATASET, FIELD, RENDERER, check_folder, open_field
 
-__all__ = ["Render"]
-
 
 @dataclass(frozen=True)
 class Render:

@@ -10,8 +10,6 @@ from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from rfedge.arguments import ADDRESS, FOLDER, TwinConnection
 
-__all__ = ["Certs", "CertsInit", "CertsShow", "Watch"]
-
 
 @dataclass(frozen=True)
 class Watch:

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from rfedge.sizing.estimate import Demand, Sizing
     from rfedge.sizing.tables import SizingTables
 
-__all__ = ["Size"]
-
 
 @dataclass(frozen=True)
 class Size:

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from rfedge.training.run import Trained, TrainingJob
     from rfedge.training.view import Snapshots
 
-__all__ = ["Train", "train_tile"]
-
 SH_RISE = 0.1
 """Share of the run after which the next degree joins; it saves time at the same quality."""
 TILE_CHECKPOINT_EVERY = 500

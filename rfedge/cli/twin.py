@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from rfedge.twin.scene import TwinScene
     from rfedge.twin.web import Source
 
-__all__ = ["Twin"]
-
 
 @dataclass(frozen=True)
 class Twin:

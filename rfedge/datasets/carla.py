@@ -30,14 +30,6 @@ from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import write_png
 
-__all__ = [
-    "CarlaRecordSettings",
-    "CarlaRecorder",
-    "intrinsics_of_fov",
-    "point_from_carla",
-    "pose_from_carla",
-]
-
 
 def pose_from_carla(world_from_sensor: Sequence[Sequence[float]]) -> Pose:
     """Return world_from_cam of a sensor's 4x4 ``Transform.get_matrix()``.

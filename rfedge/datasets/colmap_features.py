@@ -27,19 +27,6 @@ from rfcore.lens import BrownLens, FisheyeLens
 with needs("colmap"):
     import pycolmap
 
-__all__ = [
-    "PoseSettings",
-    "add_known",
-    "add_new",
-    "camera_parameters",
-    "cancellable",
-    "match",
-    "pose_from_colmap",
-    "rigid_of",
-    "source_camera",
-]
-
-
 T = TypeVar("T")
 
 DATABASE = "database.db"

@@ -28,18 +28,6 @@ from rfcore.files import whole_folder, write_whole
 from rfcore.image import write_png
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "LIST_NAME",
-    "SplitSettings",
-    "SplitTile",
-    "convert_dataset",
-    "global_points",
-    "read_tiles",
-    "split_dataset",
-    "tiles_of",
-    "write_in_own_world",
-]
-
 
 def convert_dataset(
     path: Path, out: Path, size_px: tuple[int, int] | None, chosen: slice = slice(None)

@@ -39,8 +39,6 @@ from rfedge.datasets.colmap_features import (
 with needs("colmap"):
     import pycolmap
 
-__all__ = ["PlacedPictures", "Tell", "pose_dataset", "solve_poses"]
-
 Tell = Callable[[str], None]
 """Called with a line that says what is being done."""
 MIN_PICTURES = 3

@@ -24,8 +24,6 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.files import write_whole
 from rfcore.image import rgb_from_video_frame, write_png
 
-__all__ = ["MAX_PER_SECOND", "sharpest_frames", "sharpness"]
-
 MAX_PER_SECOND = 100.0
 ABOUT = "video.json"
 

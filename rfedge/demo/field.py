@@ -22,15 +22,6 @@ from rfcore.train.splats import SplatTrainingConfig
 from rfedge.training.finish import SizeGoal, finish_field
 from rfedge.training.run import TrainingJob, train_field
 
-__all__ = [
-    "cache_path",
-    "check_sample_field",
-    "choose_field",
-    "manifest_digest",
-    "sample_field_path",
-    "trained_field",
-]
-
 SEED = 1
 
 

@@ -29,20 +29,6 @@ from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfedge.evaluate.rivals import Rival, x264_for_psnr
 from rfedge.evaluate.savings import paper_savings_percent, slice_nals
 
-__all__ = [
-    "DriveFigures",
-    "DriveOutcome",
-    "FrameAddress",
-    "FrameFigures",
-    "Pictures",
-    "RatePoint",
-    "intra_curve",
-    "measure_drive",
-    "rival_curve",
-    "saving_at_equal_psnr",
-]
-
-
 MIN_POINTS = 4
 Quality = Callable[[I420, I420], float]
 

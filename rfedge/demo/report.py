@@ -25,14 +25,6 @@ from rfedge.report.charts import (
 from rfedge.report.page import write_page
 from rfedge.results import Result, as_json, rows_of
 
-__all__ = [
-    "METRIC",
-    "SUMMARY",
-    "figures_of",
-    "print_summary",
-    "write_report",
-]
-
 
 def figures_of(result: Result) -> dict[str, DriveFigures]:
     """Return the figures of each drive in a demo's result; raises as ``rows_of``."""

@@ -36,11 +36,6 @@ from rfedge.results import make_result, provenance, write_result
 from rfedge.training.run import training_config
 from rfedge.video import write_mp4
 
-__all__ = [
-    "DemoRun",
-    "run_demo",
-]
-
 DRIVES = ("empty", "vehicles")
 VEHICLE = "demo"
 CAMERA = "front"

@@ -27,24 +27,6 @@ from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "DECIMATION",
-    "STEADY",
-    "Clip",
-    "ClipCoder",
-    "CodedClip",
-    "Drive",
-    "DriveName",
-    "DriveOfField",
-    "frames_digest",
-    "luma_mse",
-    "luma_sse",
-    "psnr_of_mse",
-    "read_drive",
-    "with_noise",
-]
-
-
 PEAK = 255.0
 STEADY = slice(1, None)
 """Every frame but the first, which a stream sends once and a clip of 24 frames counts too much."""

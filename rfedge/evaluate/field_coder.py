@@ -35,8 +35,6 @@ from rfedge.evaluate.rivals import CodedPictures
 from rfedge.evaluate.ssim import luma_ssim
 from rfedge.offline import Arrival, CodedFrame, FrameInput, decode_promised, encode_frames
 
-__all__ = ["WITHOUT_FIELD", "FieldCoder", "RenderedClip", "message_bytes", "render_clip"]
-
 LIMITS = (1.0, 51.0)
 CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
 COVERED = 0.5

@@ -19,16 +19,6 @@ from rfedge.evaluate.rate_curve import RateCurve, Window, rate_curve
 from rfedge.evaluate.runner import clip_key, coded_clip
 from rfedge.jobs import CellKey, CellStore, Rows
 
-__all__ = [
-    "HEADLINE_DB",
-    "CpuTime",
-    "Performance",
-    "perform",
-    "seconds_left",
-    "spanning_points",
-    "time_in_turns",
-]
-
 HEADLINE_DB: Window = (32.0, 35.0)
 """Window of luma PSNR that BD-rates are quoted over unless another is asked for."""
 PROBE_FRAMES = 2

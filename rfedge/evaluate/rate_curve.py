@@ -23,16 +23,6 @@ from rfedge.evaluate.clips import CodedClip
 with needs("eval"):
     from scipy.interpolate import PchipInterpolator
 
-__all__ = [
-    "RateCurve",
-    "Window",
-    "bd_rate_interval",
-    "bd_rate_percent",
-    "rate_curve",
-    "ssim_curve",
-    "ssim_db",
-]
-
 MIN_POINTS = 6
 PEAK = 255.0
 Window = tuple[float, float]

@@ -29,20 +29,6 @@ from rfcore.image import I420
 from rfedge.evaluate.clips import CodedClip, luma_mse
 from rfedge.evaluate.ssim import luma_ssim
 
-__all__ = [
-    "CodedPictures",
-    "Rival",
-    "ordinary_scheduling",
-    "svtav1_lowdelay",
-    "x264_for_psnr",
-    "x264_for_ssim",
-    "x264_lowdelay",
-    "x264_with_our_tools",
-    "x265_for_psnr",
-    "x265_for_ssim",
-    "x265_lowdelay",
-]
-
 
 @contextmanager
 def ordinary_scheduling() -> Iterator[None]:

@@ -23,8 +23,6 @@ from rfedge.jobs import Cell, CellKey, CellStore, Job, run_jobs
 from rfedge.report.tables import Parts, print_tables
 from rfedge.results import CHECKOUT, Provenance, make_result, provenance, write_result
 
-__all__ = ["Run", "clip_key", "coded_clip", "program_version"]
-
 PROGRAM = ("rfcore", "rfedge/evaluate", "rfedge/offline.py")
 """Code that every finished piece depends on."""
 

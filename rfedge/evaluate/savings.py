@@ -19,16 +19,6 @@ from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, encode_picture
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
-__all__ = [
-    "PaperSavings",
-    "intra_alone",
-    "paper_savings",
-    "paper_savings_percent",
-    "published_clip",
-    "savings_of_clip",
-    "slice_nals",
-]
-
 _TYPES = ("P", "B", "I")
 
 

@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["luma_ssim"]
-
-
 RADIUS_PX, SIGMA_PX = 5, 1.5
 C1, C2 = np.float32((0.01 * 255) ** 2), np.float32((0.03 * 255) ** 2)
 MIDDLE = np.float32(128)

@@ -27,19 +27,6 @@ from rfcore.image import Rgb, rgb_from_colour
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "AS_GIVEN",
-    "PAIRS",
-    "Convention",
-    "Fit",
-    "ModeFit",
-    "check_field",
-    "drawn_antialiased",
-    "in_drive_world",
-    "known_conventions",
-    "pairs_picture",
-]
-
 UNITS = {"": 1.0, "centimetres": 100.0, "millimetres": 1000.0, "hundreds of metres": 0.01}
 """Field units in a metre of the drive's world."""
 AS_OPENGL = Pose((0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0))

@@ -27,8 +27,6 @@ from rfcore.field.splat_archive import check_decoded_size
 from rfcore.field.splat_file import check_suffix, read_open_splat_file
 from rfcore.raster.gaussians import Gaussians
 
-__all__ = ["BEST_FIRST", "main", "read_confined"]
-
 BEST_FIRST = (Confinement.BUBBLEWRAP, Confinement.LANDLOCK)
 READER_BYTES = 1 << 30
 """Address space of the reader, beside twice what the splats take."""

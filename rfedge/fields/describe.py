@@ -30,16 +30,6 @@ from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.views import PosedPicture
 from rfedge.timing import median_ms
 
-__all__ = [
-    "anchor_text",
-    "block_differences",
-    "describe_field",
-    "disagreement_picture",
-    "frame_ms",
-    "print_levels",
-    "size_mb",
-]
-
 SHOWN_FRAMES = 4
 BLOCK_PX = 8
 FULL_RED_LEVELS = 60

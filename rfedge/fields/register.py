@@ -29,8 +29,6 @@ from rfcore.localise.estimate import PosePrior
 from rfcore.localise.localiser import Localised, Localiser, LocaliserSettings, median_depth
 from rfedge.fields.viewpoints import UPS, looking_at, middle_of
 
-__all__ = ["FieldRegistration", "RegisterSettings", "register_pictures"]
-
 F64 = NDArray[np.float64]
 Tell = Callable[[str], None]
 

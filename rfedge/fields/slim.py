@@ -28,8 +28,6 @@ from rfcore.raster.native import Rasterizer
 from rfcore.train.levels import LevelFitConfig, fitted
 from rfedge.fields.viewpoints import look_around
 
-__all__ = ["slimmed"]
-
 WIDENINGS = (0.0, 0.5, 1.0)
 """Shares of ``FULL_WIDENING`` tried."""
 FULL_WIDENING = 0.22

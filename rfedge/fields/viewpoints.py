@@ -22,20 +22,6 @@ from rfcore.image import Rgb, rgb_from_colour, write_png
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "UPS",
-    "OrbitSettings",
-    "Viewpoint",
-    "drive_viewpoints",
-    "look_around",
-    "looking_at",
-    "middle_of",
-    "orbit",
-    "orbit_viewpoints",
-    "pictures_along",
-    "write_pictures",
-]
-
 F64 = NDArray[np.float64]
 UPS = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 """Up in ENU, in OpenGL's world, and in the world of OpenCV and most COLMAP models."""

@@ -24,9 +24,6 @@ from rfcore.link.shaper import BusyMeter, Link
 from rfcore.wire.instruments import Family, Instruments
 from rfedge.link import SPIN_S
 
-__all__ = ["Direction", "LinkMetrics", "Side"]
-
-
 SEGMENT_BYTES = 4096
 """Bytes released at once: 8 ms at 4 Mbit/s, so that a long message does not arrive in one lump."""
 

@@ -34,8 +34,6 @@ from rfcore.wire.instruments import MetricsEndpoint
 from rfedge.link import LinkSettings
 from rfedge.link.direction import Direction, LinkMetrics, Side
 
-__all__ = ["LinkProxy", "main", "run_links", "run_proxy"]
-
 SCHEDULERS = {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}
 
 

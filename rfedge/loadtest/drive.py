@@ -33,18 +33,6 @@ with needs("loadtest"):
     import psutil
 
 
-__all__ = [
-    "RunMeasurements",
-    "Sample",
-    "Usage",
-    "Watcher",
-    "drive_live",
-    "drive_prerecorded",
-    "links_busy",
-    "measured",
-    "vehicle_report",
-]
-
 EVERY_S = 0.5
 
 

@@ -33,8 +33,6 @@ from rfcore.wire.notices import StreetNotice
 from rfedge.loadtest.grpc_call import GrpcCall, Status
 from rfedge.loadtest.prerecorded import End, PrerecordedDrive, Replay, Schedule
 
-__all__ = ["FleetSpec", "PrerecordedVehicle", "main", "run_fleet", "wall_ns"]
-
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
 CODES = {code.value[0]: code.name for code in grpc.StatusCode}
 

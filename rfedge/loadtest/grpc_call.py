@@ -25,8 +25,6 @@ with needs("loadtest"):
     from h2.connection import H2Connection
     from h2.exceptions import H2Error
 
-__all__ = ["CALL", "GrpcCall", "Status"]
-
 MESSAGE_HEAD = struct.Struct(">BI")
 """gRPC's prefix of a message: a compressed flag and the length."""
 CALL = 1

@@ -23,21 +23,6 @@ from rfcore.errors import InvalidInput
 from rfcore.wire.settings import RenderSettings
 from rfcore.wire.values import MAX_CAMERAS, MAX_PAYLOAD_BYTES
 
-__all__ = [
-    "Bounds",
-    "Load",
-    "Measured",
-    "Mode",
-    "Resources",
-    "VehicleReport",
-    "Vehicles",
-    "Verdict",
-    "judge",
-    "limit",
-    "nearest",
-    "share_at_least",
-]
-
 
 class Mode(StrEnum):
     """The part of its work that the server does for each frame.

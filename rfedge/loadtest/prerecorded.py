@@ -43,17 +43,6 @@ from rfcore.wire.messages import (
     ServerMessage,
 )
 
-__all__ = [
-    "CAMERA",
-    "End",
-    "PrerecordedDrive",
-    "Replay",
-    "Schedule",
-    "Shot",
-    "payload_drive",
-    "prerecorded_drive",
-]
-
 
 class End(StrEnum):
     """The fate of a picture; ``open``: it was not answered when the test was over."""

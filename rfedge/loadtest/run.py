@@ -38,20 +38,6 @@ from rfedge.report.page import write_page
 from rfedge.report.tables import text_table
 from rfedge.results import make_result, provenance, write_result
 
-__all__ = [
-    "LoadResult",
-    "LoadRow",
-    "Run",
-    "TestBed",
-    "largest_held",
-    "latency_chart",
-    "print_runs",
-    "recorded",
-    "run_load",
-    "run_loads",
-    "write_load_result",
-]
-
 
 @dataclass(frozen=True)
 class TestBed:

@@ -33,8 +33,6 @@ from rfcore.wire.messages import CameraDescription, StageTimes
 from rfcore.wire.settings import configure_logs
 from rfedge.loadtest.plan import Mode
 
-__all__ = ["KeptFields", "KeptRenders", "PassingDecoder", "passing", "with_kept_renders"]
-
 MAX_KEPT = 64
 """Renders of 640x360 are 4.6 MB each."""
 

@@ -28,8 +28,6 @@ from rfedge.results import provenance
 with needs("localise"):
     import cv2
 
-__all__ = ["write_localise_report"]
-
 WHY = {
     Obstacle.FEW_FEATURES: "the picture has too few features: dark, fog, or out of focus",
     Obstacle.FEW_INLIERS: "no pose explains enough of the matches between picture and render",

@@ -37,22 +37,6 @@ from rfcore.localise.localiser import Localised, Localiser, Lost, median_depth
 from rfcore.motion import rotation_vector
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "RecordedFeed",
-    "SearchOutcome",
-    "SearchSummary",
-    "StartError",
-    "displaced",
-    "median_cpu_ms",
-    "parse_start_error",
-    "pose_difference",
-    "search",
-    "searches_from",
-    "searches_from_displaced",
-    "typical_start",
-    "write_poses",
-]
-
 WITHIN_OF_DEPTH = 0.003
 WITHIN_DEG = 0.1
 ASIDE = 0.1

@@ -23,31 +23,6 @@ from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.image import Rgb, jpeg_bytes
 
-__all__ = [
-    "BLUE",
-    "DIFFERENCE_GAIN",
-    "GREY",
-    "GRID",
-    "INK",
-    "LINES",
-    "MARKERS",
-    "MUTED",
-    "PAYLOAD",
-    "RENDER",
-    "STYLE",
-    "Lines",
-    "amplified_difference",
-    "bytes_chart",
-    "curve_chart",
-    "embedded",
-    "new_axes",
-    "quality_chart",
-    "stages_chart",
-    "svg",
-    "write_figure",
-]
-
-
 mpl.use("svg")
 
 INK, MUTED, GRID = "#1c2733", "#6b7785", "#dfe4ea"

@@ -11,8 +11,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rfcore.files import write_whole
 
-__all__ = ["write_page"]
-
 
 def write_page(
     path: Path, template: str, headline: str, made: Mapping[str, Any], **content: Any

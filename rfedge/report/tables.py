@@ -30,19 +30,6 @@ from rfcore.errors import InvalidInput
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = [
-    "PAGE_COLUMNS",
-    "Column",
-    "Parts",
-    "Table",
-    "cell",
-    "columns",
-    "named_columns",
-    "print_tables",
-    "shown",
-    "text_table",
-]
-
 PAGE_COLUMNS = 8
 """At most so many columns of a page's table fit a screen."""
 BORDER = 3

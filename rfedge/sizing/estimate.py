@@ -21,17 +21,6 @@ from tyro.conf import arg
 from rfcore.errors import InvalidInput
 from rfedge.sizing.tables import CameraDemand, SizingCell, SizingTables, check_reach, log_at
 
-__all__ = [
-    "Assumptions",
-    "Demand",
-    "Estimate",
-    "Sizing",
-    "estimate",
-    "nearest_cell",
-    "needed_bps",
-    "share_in_time",
-]
-
 INSTANTS = 400
 """Length of the simulation, in pictures of a camera."""
 PRECISION = 1.005

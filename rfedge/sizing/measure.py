@@ -30,14 +30,6 @@ from rfedge.offline import FrameInput, decode_promised, encode_frames
 from rfedge.sizing.estimate import Demand
 from rfedge.sizing.tables import SizingCell, SizingTables, interpolated
 
-__all__ = [
-    "MIN_FRAMES",
-    "SETTLED_FRAMES",
-    "measured_cells",
-    "own_tables",
-    "read_sized_drive",
-]
-
 MIN_FRAMES = 5
 SETTLED_FRAMES = 8
 SETTLING = slice(4, None)

@@ -25,18 +25,6 @@ from pathlib import Path
 from rfcore.errors import InvalidInput
 from rfedge.results import read_result, rows_of
 
-__all__ = [
-    "CODECS",
-    "SHIPPED",
-    "CameraDemand",
-    "SizingCell",
-    "SizingTables",
-    "check_reach",
-    "log_at",
-    "read_tables",
-    "shipped_tables",
-]
-
 MAX_BEYOND_FACTOR = 2.0
 MAX_BEYOND_DB = 1.0
 MARGIN = 1e-6

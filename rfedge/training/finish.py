@@ -36,16 +36,6 @@ from rfcore.update.passes import SeenFrame, spread
 from rfcore.update.run import Trial, saved_percent, try_field
 from rfcore.views import PosedPicture
 
-__all__ = [
-    "SIZES",
-    "FieldSize",
-    "FieldSizer",
-    "SizeGoal",
-    "finish_field",
-    "fit_levels",
-    "size_goal",
-]
-
 MOST_CAMERAS = 60
 """Number of cameras, evenly spread, from which the visible directions of splats are taken."""
 TRIAL_FRAMES = 8

@@ -21,8 +21,6 @@ from rfcore.field import RadianceField
 from rfcore.train.trainer import FieldTrainer, read_checkpoint, write_checkpoint
 from rfedge.arguments import time_text
 
-__all__ = ["LoopLimits", "LoopStatus", "TrainingLoop", "run_showing"]
-
 Result = TypeVar("Result")
 Measure = Callable[[RadianceField], float]
 MAX_MINUTES = 7 * 24 * 60.0

@@ -16,8 +16,6 @@ from rfcore.views import PosedPicture
 from rfedge.report.charts import DIFFERENCE_GAIN, amplified_difference, curve_chart, embedded
 from rfedge.report.page import write_page
 
-__all__ = ["write_training_report"]
-
 
 def write_training_report(
     path: Path, result: Mapping[str, Any], field: RadianceField, held_out: Dataset | None

@@ -39,25 +39,6 @@ from rfcore.views import PosedPicture
 from rfedge.results import make_result, provenance
 from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing
 
-__all__ = [
-    "UNLIMITED_ITERATIONS",
-    "PoseRefinement",
-    "Trained",
-    "TrainingJob",
-    "aligned_quality",
-    "available_bytes",
-    "check_memory",
-    "needed_bytes",
-    "ngp_training_bytes",
-    "refinement_of",
-    "splat_training_bytes",
-    "train",
-    "train_field",
-    "training_config",
-    "training_result",
-    "write_refined_poses",
-]
-
 
 @dataclass(frozen=True)
 class PoseRefinement:

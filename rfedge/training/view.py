@@ -21,8 +21,6 @@ from rfcore.train.trainer import FieldTrainer
 from rfedge.processes import service
 from rfedge.twin.web import WebSettings
 
-__all__ = ["SHARE", "Snapshots", "shown_in_browser"]
-
 SHARE = 0.02
 """Largest share of the time that writing snapshots may take."""
 SOONEST_S = 2.0

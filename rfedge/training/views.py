@@ -25,15 +25,6 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.train.start import points_from_depth
 from rfcore.views import PointCloud, PosedPicture
 
-__all__ = [
-    "ViewChoice",
-    "points_from_depth_maps",
-    "read_depth_m",
-    "read_views",
-    "share_of_views",
-    "split_every",
-]
-
 POINTS = 300_000
 """Approximate number of points to make: twice what a run draws by default."""
 MILLIMETRES = 1000.0

@@ -29,8 +29,6 @@ from rfcore.perception.objects import CameraKey
 from rfcore.wire.twin import TwinPicture
 from rfedge.twin.scene import TwinScene
 
-__all__ = ["Comparer", "Comparison", "compared"]
-
 GAIN = 2
 """Factor by which differences are amplified, around mid-grey."""
 

@@ -16,8 +16,6 @@ from rfcore.views import PosedPicture
 from rfcore.wire.twin import PictureEncoding
 from rfedge.twin.scene import DrivePicture, PlacedField, TwinScene
 
-__all__ = ["DriveSource", "FollowedFile"]
-
 LOOK_EVERY_S = 0.5
 TILE = "field"
 

@@ -50,8 +50,6 @@ with needs("nats"):
     from nats.aio.client import Client
     from nats.aio.msg import Msg
 
-__all__ = ["NatsPictures", "NatsReader", "NatsSource", "SharedTwin"]
-
 log = structlog.get_logger()
 
 EXPIRE_EVERY_S: Final = 0.5

@@ -19,8 +19,6 @@ from rfcore.field.spz import encode_spz
 from rfcore.perception.objects import CameraKey, StreetObject
 from rfcore.wire.twin import NewestQueue, TwinPicture
 
-__all__ = ["Board", "DrivePicture", "Message", "PlacedField", "Reader", "TwinScene"]
-
 CONNECTION, FIELDS, TILES = ("connection",), ("fields",), ("tiles",)
 
 

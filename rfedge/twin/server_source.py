@@ -37,8 +37,6 @@ from rfcore.wire.v1 import field_pb2, twin_pb2, twin_pb2_grpc
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.twin.scene import Message, PlacedField, TwinScene
 
-__all__ = ["LiveView", "ServerSource", "tile_rows", "view_message"]
-
 log = structlog.get_logger()
 
 RETRY_S = 0.5

@@ -35,18 +35,6 @@ from rfedge.twin.server_source import ServerSource
 with needs("twin"):
     from aiohttp import WSCloseCode, WSMsgType, web
 
-__all__ = [
-    "Look",
-    "Select",
-    "ShowObjects",
-    "Source",
-    "TwinRun",
-    "TwinWeb",
-    "WebSettings",
-    "run_twin",
-    "wish",
-]
-
 log = structlog.get_logger()
 
 PAGE: Final = Path(__file__).parent / "page"

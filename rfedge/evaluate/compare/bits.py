@@ -31,8 +31,6 @@ from rfcore.views import FieldView
 from rfedge.evaluate.compare.foreground import by_macroblock, composed
 from rfedge.evaluate.field_coder import RenderedClip
 
-__all__ = ["KINDS", "SplitClip", "macroblock_kinds", "split_rows"]
-
 KINDS = ("static", "moving", "disoccluded", "entering", "off-map")
 PRECEDENCE = ("off-map", "moving", "entering", "disoccluded")
 SHARE = 0.25

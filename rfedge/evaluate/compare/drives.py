@@ -46,18 +46,6 @@ from rfedge.evaluate.rivals import (
 )
 from rfedge.evaluate.runner import program_version
 
-__all__ = [
-    "PAID_AGAINST",
-    "DriveComparison",
-    "asked_families",
-    "foreign_coder",
-    "jobs_of_drives",
-    "read_drive_comparisons",
-    "rival_families",
-    "ssim_rivals",
-]
-
-
 PAID_AGAINST = "x264-lowdelay-psnr"
 """The rival against which a field has to save its own bytes."""
 KEYINTS = (10, 30, 250)

@@ -25,8 +25,6 @@ from rfedge.evaluate.compare.rows import (
 from rfedge.report.charts import STYLE, Lines, write_figure
 from rfedge.results import Result, rows_of
 
-__all__ = ["write_bd_rates", "write_compare_figures"]
-
 mpl.use("svg")
 
 SHOWN = {

@@ -28,8 +28,6 @@ from rfedge.evaluate.rate_curve import RateCurve, bd_rate_percent
 from rfedge.evaluate.rivals import Rival, x264_for_psnr
 from rfedge.evaluate.ssim import luma_ssim
 
-__all__ = ["ForegroundCoder", "by_macroblock", "composed", "foreground_mask", "foreground_row"]
-
 MACROBLOCK_PX = 16
 DIFFERENT_LEVELS = 12
 IDR_EACH_FRAMES = 10

@@ -34,16 +34,6 @@ from rfedge.evaluate.rate_curve import (
     ssim_db,
 )
 
-__all__ = [
-    "PASSES",
-    "SSIM_WINDOW",
-    "WINDOWS_DB",
-    "break_even_row",
-    "compare_rows",
-    "curve_rows",
-    "ssim_rows",
-]
-
 WINDOWS_DB: tuple[Window, ...] = (HEADLINE_DB, (30.0, 33.0), (30.0, 35.0), (35.0, 38.0))
 """The headline window, then others."""
 ANCHORS_AND_BEST = ("x264-lowdelay", "x264-our-tools", BEST, BEST_OF_ANY_CPU)

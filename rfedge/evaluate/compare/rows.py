@@ -14,22 +14,6 @@ from typing import Any, TypeVar
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
-__all__ = [
-    "BEST",
-    "BEST_OF_ANY_CPU",
-    "HEADLINE_ANCHOR",
-    "BitShareRow",
-    "BreakEvenRow",
-    "CompareRow",
-    "CurveRow",
-    "ForegroundRow",
-    "SsimRow",
-    "compare_parts",
-    "of_first_method",
-    "of_first_window",
-    "without_field",
-]
-
 BEST = "best-comparable"
 """The family of the strongest rival that takes no more processor time than ours at both ends."""
 BEST_OF_ANY_CPU = "best-of-any-cpu"

@@ -45,8 +45,6 @@ from rfedge.evaluate.runner import Run, clip_key
 from rfedge.jobs import CellStore, Job, Tell
 from rfedge.results import rows_of
 
-__all__ = ["run_compare"]
-
 PARTS = 4
 """A drive's coders are split into so many jobs, each of which renders the drive anew in seconds."""
 

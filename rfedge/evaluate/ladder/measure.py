@@ -41,15 +41,6 @@ from rfedge.evaluate.clips import Drive, luma_mse, psnr_of_mse
 from rfedge.evaluate.field_coder import message_bytes
 from rfedge.offline import CodedFrame, FrameInput, decode_promised, encode_frames
 
-__all__ = [
-    "TimedRenders",
-    "TrackedDrive",
-    "measure_frames",
-    "measure_rung",
-    "time_renders",
-    "track_drive",
-]
-
 SENDER_STAGES = ("references", "encode", "closed_loop")
 RECEIVER_STAGES = ("references", "splice", "decode")
 Row = dict[str, Any]

@@ -10,15 +10,6 @@ from rfcore.errors import InvalidInput
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
-__all__ = [
-    "FIGURES",
-    "LadderRow",
-    "TrackingRow",
-    "front_of",
-    "front_table",
-    "middle_rows",
-]
-
 
 @dataclass(frozen=True)
 class LadderRow:

@@ -32,9 +32,6 @@ from rfedge.evaluate.runner import Run, program_version
 from rfedge.jobs import CellKey
 from rfedge.results import rows_of
 
-__all__ = ["CRFS", "fronts", "rate_percents", "run_ladder", "rungs_for"]
-
-
 RungRow = Mapping[str, Any]
 CRFS = (23.0, 28.0, 33.0)
 EFFORTS = ("default", "thorough", "fast")

@@ -29,18 +29,6 @@ from rfedge.jobs import CellStore
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
-__all__ = [
-    "ALLOWED_PERCENT",
-    "AT_DB",
-    "CONTROLS",
-    "NeverWorse",
-    "NeverWorseRow",
-    "controls_of",
-    "never_worse_parts",
-    "run_never_worse",
-]
-
-
 AT_DB = (31.0, 33.0, 35.0)
 ALLOWED_PERCENT = 2.0
 QUICK_FRAMES = 6
