@@ -109,7 +109,7 @@ def pack_sample(built: Path, sample: Path) -> None:
     """Write pictures, transforms, points and manifest of ``sample`` from the scenes in ``built``.
 
     ``built`` has a folder for each scene, ``empty`` and ``vehicles``, as ``streetgen build``
-    leaves it. Other files of the sample stay and are listed with the rest. Raises ``DatasetError``
+    leaves it. Other files of the sample stay. Raises ``DatasetError``
     for a scene that is missing or incomplete, or has a picture that cannot be read; the sample is
     then untouched.
     """

@@ -9,7 +9,8 @@ the new one. A folder is not replaced: it must not exist before.
 
 ``manifest.json`` lists a directory's files with their SHA-256, so that damage is noticed before
 use. It is ``{"sha256": {"train/000.jpg": "<hex>", ...}}`` with paths relative to it;
-other keys say how the directory was made and are not read.
+other keys say how the directory was made and are not read. The directory's ``README.md`` is not
+listed: its words may change, and the data stay the same.
 """
 
 from __future__ import annotations
@@ -109,14 +110,17 @@ MANIFEST_NAME = "manifest.json"
 
 
 def write_manifest(directory: Path, about: Mapping[str, Any] | None = None) -> Path:
-    """List every file under ``directory`` with its SHA-256; return the manifest's path.
+    """List the files under ``directory`` with their SHA-256; return the manifest's path.
 
     ``about`` stands before the list: what made the directory.
     """
     files = sorted(path for path in directory.rglob("*") if path.is_file())
     target = directory / MANIFEST_NAME
+    unlisted = (target, directory / "README.md")
     digests = {
-        path.relative_to(directory).as_posix(): _sha256(path) for path in files if path != target
+        path.relative_to(directory).as_posix(): _sha256(path)
+        for path in files
+        if path not in unlisted
     }
     write_whole(target, json.dumps({**(about or {}), "sha256": digests}, indent=1) + "\n")
     return target

@@ -24,6 +24,14 @@ def test_what_was_listed_verifies_and_listing_again_changes_nothing(directory):
     assert (directory / "manifest.json").read_bytes() == before
 
 
+def test_words_about_the_data_may_change(directory):
+    before = (directory / "manifest.json").read_bytes()
+    (directory / "README.md").write_text("about the data\n")
+    assert write_manifest(directory).read_bytes() == before
+    (directory / "sub" / "README.md").write_text("data\n")
+    assert b"sub/README.md" in write_manifest(directory).read_bytes()
+
+
 def test_a_flipped_bit_is_named(directory):
     (directory / "sub" / "a.bin").write_bytes(b"ona")
     with pytest.raises(DatasetError, match=r"sub/a\.bin: damaged"):

@@ -78,7 +78,7 @@ def test_the_manifest_lists_everything_and_says_what_rendered_it(built, sample):
     verify_manifest(sample)
     manifest = json.loads((sample / "manifest.json").read_bytes())
     assert manifest["scenes"]["vehicles"] == {"command": "streetgen build vehicles"}
-    assert {"README.md", "train/002.jpg", "drive_empty/001.webp"} <= manifest["sha256"].keys()
+    assert {"points.ply", "train/002.jpg", "drive_empty/001.webp"} <= manifest["sha256"].keys()
 
 
 def test_pictures_of_an_earlier_packing_do_not_stay(built, sample):
