@@ -135,6 +135,11 @@ class StreamClient:
         return not self._is_finishing and self._session.state is LinkState.STREAMING
 
     @property
+    def waits_for(self) -> str:
+        """Return what keeps a picture from being sent or answered; "" for nothing."""
+        return self._session.waits_for
+
+    @property
     def is_draining(self) -> bool:
         """Return whether the server is draining: it takes pictures until another one does."""
         return self._session.is_draining

@@ -29,9 +29,10 @@ from cav_agent.capture_schedule import CaptureSchedule
 from cav_agent.client import CameraTaken, FieldNotServed, StreamClient, StreamOwner
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.frame_log import DriveObserver
-from cav_agent.frames import FrameResult, RetryReason
+from cav_agent.frames import FrameResult, Outcome, RetryReason
 from cav_agent.handover import LOST_AFTER_S, Handover, ServedTile, TileRoute
 from rfcore.errors import ProtocolError, RfedgeError
+from rfcore.wire.waits import FIRST_S, WaitLog, log_wait
 
 log = structlog.get_logger()
 
@@ -85,7 +86,8 @@ class HandoverController:
         self._stopping = False
         self._was_welcomed = False
         self._failed: RfedgeError | None = None
-        self._began_s = self._streaming_at_s = time.monotonic()
+        self._began_s = self._streaming_at_s = self._answered_at_s = time.monotonic()
+        self._waits = WaitLog(log_wait, first_s=0.0)
 
     def tiles_published(self, server: int, tiles: Sequence[ServedTile]) -> None:
         """Follow what a server publishes now."""
@@ -118,6 +120,7 @@ class HandoverController:
                 knows_first = 0 in self._tiles or now - self._began_s >= LOST_AFTER_S
                 if self._handover is not None and knows_first:
                     self._advance(self._handover, now)
+                    self._waits.note(self._waits_for(self._handover, now), now)
                 await self._rest(now)
             await self._finish()
         finally:
@@ -134,6 +137,8 @@ class HandoverController:
     def ended(self, result: FrameResult) -> None:
         """Count a picture that came to its end; the schedule may end the drive with an error."""
         self.counts[str(result.outcome)] += 1
+        if result.outcome in (Outcome.ACKED, Outcome.NACKED):
+            self._answered_at_s = time.monotonic()
         self._observer.ended(result)
         try:
             self._schedule.ended(result)
@@ -145,6 +150,15 @@ class HandoverController:
         """Note that a server has welcomed the vehicle."""
         self._was_welcomed = True
         self._changed.set()
+
+    def _waits_for(self, handover: Handover, now: float) -> str:
+        """Return what the drive waits for, once no picture was answered for ``FIRST_S``."""
+        if now - self._answered_at_s < FIRST_S:
+            return ""
+        waits_for = self._candidate(handover, now).waits_for(now)
+        if not waits_for and self._schedule.get_timer() is None and not self._is_done():
+            return "the next picture of the camera" if self._streaming() else ""
+        return waits_for
 
     # --- pictures
 
@@ -300,6 +314,14 @@ class TileStream:
     def is_draining(self) -> bool:
         """Return whether the server is draining: it takes pictures until another one does."""
         return self.client is not None and self.client.is_draining
+
+    def waits_for(self, now: float) -> str:
+        """Return what the stream waits for; "" for nothing, or for what was logged already."""
+        if now < self.retry_at_s:
+            return ""
+        if self._open is None:
+            return f"field {self.served.tile.field_id} of tile {self.served.tile.name}"
+        return "" if self.client is None else self.client.waits_for
 
     @property
     def tasks(self) -> list[asyncio.Task[OpenStream] | asyncio.Task[None]]:

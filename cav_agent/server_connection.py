@@ -7,23 +7,28 @@ refused certificate is not mistaken for a server that is away.
 from __future__ import annotations
 
 import asyncio
+import time
 from types import TracebackType
 from typing import Self
 
 import grpc
+import structlog
 
 from cav_agent.config import AgentConfig
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.address import Address, check_handshake
-from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, VEHICLE
+from rfcore.wire.conventions import CHANNEL_OPTIONS, RECONNECT_S, RETRY_AFTER, VEHICLE
 from rfcore.wire.tiles import MAX_TILES, Tile, tile_of
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfcore.wire.values import check_field_id
+from rfcore.wire.waits import WaitLog, log_wait, waiting
+
+log = structlog.get_logger()
 
 ASK_AFTER_S = 1.0
-"""After this time without a connection, the vehicle checks whether the server refuses it."""
+"""Period at which the vehicle checks why it has no connection; gRPC tries again more often."""
 
 REFUSED = (grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED)
 
@@ -51,6 +56,8 @@ class ServerConnection:
         self.fields_changed = asyncio.Event()
         self._tls = tls
         self._channel: grpc.aio.Channel | None = None
+        self._problem = ""
+        self._failures = WaitLog(self._say_failure, first_s=0.0)
 
     async def __aenter__(self) -> Self:
         self._channel = self._open()
@@ -81,13 +88,14 @@ class ServerConnection:
     async def wait_until_ready(self, within_s: float | None) -> None:
         """Wait until the channel is connected, for ever if ``within_s`` is None.
 
-        Raises ``AccessDenied`` if the ends refuse each other, else ``TimeoutError``.
+        What keeps it from connecting is logged. Raises ``AccessDenied`` if the ends refuse each
+        other, else ``TimeoutError``.
         """
         try:
             async with asyncio.timeout(within_s):
-                await (self.channel.channel_ready() if self._tls is None else self._ready_by_tls())
+                await self._ready()
         except TimeoutError:
-            await self._check_handshake()
+            await self._ask()
             raise
 
     async def require(self, within_s: float | None) -> grpc.aio.Channel:
@@ -106,13 +114,16 @@ class ServerConnection:
         ``RfedgeError`` when no answer comes within ``within_s``.
         """
         stub = FieldServiceStub(await self.require(within_s))
+        limit_s = LIST_S if within_s is None else within_s
+        what = f"the list of fields of {self.address}"
         try:
-            async with asyncio.timeout(LIST_S if within_s is None else within_s):
-                listed = await stub.ListFields(
-                    pb.ListFieldsRequest(), metadata=self.metadata, wait_for_ready=True
-                )
+            with waiting(what, log_wait):
+                async with asyncio.timeout(limit_s):
+                    listed = await stub.ListFields(
+                        pb.ListFieldsRequest(), metadata=self.metadata, wait_for_ready=True
+                    )
         except TimeoutError as error:
-            raise self._no_server(within_s or LIST_S) from error
+            raise self._no_server(limit_s) from error
         except grpc.aio.AioRpcError as error:
             if error.code() in REFUSED:
                 raise AccessDenied(f"{self.address}: {error.details()}") from error
@@ -120,20 +131,38 @@ class ServerConnection:
         return _tiles_of(listed)
 
     def _no_server(self, within_s: float) -> RfedgeError:
-        return RfedgeError(f"no server at {self.address} within {within_s:g} s")
+        cause = f": {self._problem}" if self._problem else ""
+        return RfedgeError(f"no server at {self.address} within {within_s:g} s{cause}")
 
-    async def _ready_by_tls(self) -> None:
+    async def _ready(self) -> None:
         ready = asyncio.ensure_future(self.channel.channel_ready())
         try:
             while not (await asyncio.wait({ready}, timeout=ASK_AFTER_S))[0]:
-                await self._check_handshake()
+                await self._ask()
             ready.result()
         finally:
             ready.cancel()
             await asyncio.gather(ready, return_exceptions=True)
+        if self._problem:
+            log.info("server reached", server=str(self.address))
+        self._note("")
 
-    async def _check_handshake(self) -> None:
-        await asyncio.to_thread(check_handshake, self.address, self._tls)
+    async def _ask(self) -> None:
+        """Find out, and log, why there is no connection; raise ``AccessDenied`` for a refusal."""
+        self._note(await asyncio.to_thread(check_handshake, self.address, self._tls))
+
+    def _note(self, problem: str) -> None:
+        self._problem = problem
+        self._failures.note(problem, time.monotonic())
+
+    def _say_failure(self, problem: str, since_s: float) -> None:
+        log.warning(
+            "no connection",
+            server=str(self.address),
+            problem=problem,
+            since_s=round(since_s, 1),
+            again_in_s=RECONNECT_S,
+        )
 
 
 def server_connections(config: AgentConfig) -> tuple[ServerConnection, ...]:

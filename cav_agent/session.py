@@ -146,6 +146,20 @@ class AgentSession:
         """Return whether no picture waits, is being encoded or is unanswered."""
         return not (self._waiting or self._job or self._in_flight)
 
+    @property
+    def waits_for(self) -> str:
+        """What keeps a picture from being sent or answered; "" for nothing, or no connection."""
+        if self.state is LinkState.GREETING:
+            return "the server's welcome"
+        if self.state is LinkState.DISCONNECTED or self.is_idle:
+            return ""
+        if self._job is not None:
+            return "the encoder"
+        if self._in_flight:
+            return "the server's answer to a frame"
+        may_send = any(camera.may_send for camera in self._cameras.values())
+        return "room on the link" if may_send else "credit of the server"
+
     # --- connection
 
     def connected(self, now: float) -> None:

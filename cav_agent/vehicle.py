@@ -255,8 +255,14 @@ class Vehicle:
                 if len(self._servers) == 1 and not is_known and not _may_pass(error, self._config):
                     raise
                 self._metrics.retries.labels(RetryReason.TILES).inc()
-                log.warning("tiles not listed", server=str(server.address), problem=str(error))
-                await asyncio.sleep(backoff.next_s())
+                pause_s = backoff.next_s()
+                log.warning(
+                    "tiles not listed",
+                    server=str(server.address),
+                    problem=str(error),
+                    again_in_s=round(pause_s, 2),
+                )
+                await asyncio.sleep(pause_s)
                 continue
             backoff.reset()
             if self._live is not None and len(tiles) > 1 and not self._live.knows_route:

@@ -23,6 +23,7 @@ from lab.rig import EvalRig
 from lab.robust import EvalRobust
 from lab.servers import EvalScale
 from lab.size_tables import EvalSizing
+from lab.tcp import EvalTcp
 from lab.world import EvalWorld
 from rfedge.program import CONFIG, run_program
 
@@ -42,6 +43,7 @@ Verb = (
     | Annotated[EvalRobust, subcommand("robust")]
     | Annotated[EvalScale, subcommand("scale")]
     | Annotated[EvalSizing, subcommand("size-tables")]
+    | Annotated[EvalTcp, subcommand("tcp")]
     | Annotated[EvalWorld, subcommand("world")]
 )
 

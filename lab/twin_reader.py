@@ -45,7 +45,7 @@ class TwinReader:
 
     def _read(self) -> None:
         try:
-            for message in self._client.watch(self._subscription, self._connected.set):
+            for message in self._client.watch(self._subscription, lambda _: self._connected.set()):
                 if isinstance(message, TwinPicture):
                     self._take(message)
         except RfedgeError as error:

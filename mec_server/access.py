@@ -48,6 +48,16 @@ class Grant:
         """Whether a picture of ``vehicle_id`` may be seen, whose field belongs to ``tiles``."""
         return self.everything or vehicle_id in self.vehicles or bool(self.tiles & tiles)
 
+    def described(self, published: frozenset[str]) -> str:
+        """Return what may be seen where these tiles are published; "" for everything."""
+        if self.everything:
+            return ""
+        here, away = sorted(self.tiles & published), sorted(self.tiles - published)
+        seen = [f"vehicle {name}" for name in sorted(self.vehicles)]
+        seen += [f"tile {name}" for name in here]
+        missing = f" (this server has no tile {', '.join(away)})" if away else ""
+        return (", ".join(seen) or "nothing") + missing
+
     def check_vehicles(self, vehicle_ids: frozenset[str]) -> None:
         """Raise ``AccessDenied`` for vehicles asked for by name that can never be seen."""
         if self.everything or self.tiles:

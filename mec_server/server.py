@@ -64,6 +64,7 @@ from rfcore.wire.address import Address
 from rfcore.wire.conventions import SERVER_OPTIONS
 from rfcore.wire.instruments import Family, MetricsEndpoint
 from rfcore.wire.values import MAX_FIELDS
+from rfcore.wire.waits import log_wait, waiting
 
 if TYPE_CHECKING:
     from mec_server.twin.nats import NatsServices
@@ -466,7 +467,9 @@ class EdgeServer:
         def may_draw(field_id: str) -> bool:
             return self._guard.may_fetch(context, self._published.names_of(field_id))
 
-        return ConsumerAccess(covers, grant.check_vehicles, may_draw)
+        published = frozenset(tile.name for tile in self._published.tiles)
+        may_see = grant.described(published)
+        return ConsumerAccess(covers, grant.check_vehicles, may_draw, may_see)
 
     def _follow(
         self, work: Callable[[], Awaitable[object]], every_s: float, task: BackgroundTask
@@ -515,7 +518,8 @@ async def serve(config: ServerConfig, opened: OpenCameras = open_cameras) -> Non
     stopped = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    await server.start()
+    with waiting(f"fields of {config.fields} to be opened", log_wait):
+        await server.start()
     gc.collect()
     gc.freeze()  # a search of all objects for cycles stops every thread for 50 ms
     await stopped.wait()

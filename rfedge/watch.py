@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, wait
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -36,6 +36,7 @@ from rfcore.wire.twin import (
     TwinPicture,
 )
 from rfcore.wire.values import check_name
+from rfcore.wire.waits import waiting
 
 TICKS_PER_S = 90_000
 """Resolution of a video's times, as in MPEG systems."""
@@ -154,8 +155,17 @@ UNFINISHED = "rfedge watch: ended before its files were complete\n"
 class PictureSource(Protocol):
     """A source of pictures: a ``TwinClient``, or the servers of one NATS."""
 
-    def watch(self, subscription: Subscription) -> Generator[TwinPicture | Departure, None, None]:
-        """Yield what arrives until ``stop``; raise ``RfedgeError`` if the source is not there."""
+    def watch(
+        self,
+        subscription: Subscription,
+        connected: Callable[[str], None] = ...,
+        problem: Callable[[str], None] = ...,
+    ) -> Generator[TwinPicture | Departure, None, None]:
+        """Yield what arrives until ``stop``; raise ``RfedgeError`` if the source is not there.
+
+        ``connected`` is called with what may be seen, "" for everything; ``problem`` with why there
+        is no connection.
+        """
 
     def stop(self) -> None:
         """End ``watch``, from any thread."""
@@ -204,8 +214,12 @@ def watch(settings: WatchSettings, source: PictureSource) -> None:
     with ExitStack() as stack:
         folder = PictureFolder(settings.folder) if settings.folder else None
         video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
-        messages = stack.enter_context(closing(source.watch(settings.subscription)))
+        wait_for = stack.enter_context(waiting("a picture", _say_wait))
+        messages = stack.enter_context(
+            closing(source.watch(settings.subscription, _say_connected, _say))
+        )
         for message in messages:
+            wait_for("another picture")
             print(_line(message), flush=True)
             if isinstance(message, Departure):
                 continue
@@ -216,6 +230,18 @@ def watch(settings: WatchSettings, source: PictureSource) -> None:
             pictures += 1
             if pictures == settings.pictures:
                 return
+
+
+def _say(text: str) -> None:
+    print(f"rfedge watch: {text}", file=sys.stderr, flush=True)
+
+
+def _say_connected(may_see: str) -> None:
+    _say("connected" + (f"; this certificate may see: {may_see}" if may_see else ""))
+
+
+def _say_wait(what: str, waited_s: float) -> None:
+    _say(f"waiting for {what} for {waited_s:.0f} s")
 
 
 def watch_until_stopped(settings: WatchSettings, source: PictureSource) -> None:

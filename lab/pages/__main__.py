@@ -25,6 +25,7 @@ from lab.rig.report import REPORT as RIG
 from lab.robust.report import REPORT as ROBUST
 from lab.servers.cases import SCALE, WORLD
 from lab.soak import REPORT as SOAK
+from lab.tcp.run import REPORT as TCP
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfedge.results import Result, read_result
@@ -36,7 +37,7 @@ KINDS: Mapping[str, Report] = {
     report.kind: report
     for report in (
         *REPORTS[:3],
-        *(PAPER, BENCHMARK, CLASSES, ADAPT, LATENCY, ROBUST, LOCALISE, SIZING),
+        *(PAPER, BENCHMARK, CLASSES, ADAPT, LATENCY, ROBUST, TCP, LOCALISE, SIZING),
         *(LOADS, RATIO, RIG, LIVE, WORLD, SCALE, FAULTS, ATTACKS, STABILITY, SOAK),
         *REPORTS[3:],
     )

@@ -27,6 +27,7 @@ from mec_server.twin.rendering import ViewedTile, ViewService
 from mec_server.twin.state import Covers, Entry, Mailbox, ReceivedPicture, Twin
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
 from rfcore.perception.objects import ObjectReports, StreetObject
+from rfcore.wire.conventions import MAY_SEE
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -87,6 +88,8 @@ class ConsumerAccess:
     covers: Covers
     check_vehicles: Callable[[frozenset[str]], None]
     may_draw: Callable[[str], bool]
+    may_see: str = ""
+    """What the consumer may see in words; "" for everything."""
 
 
 class ConsumerStream:
@@ -294,7 +297,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         writer = _PictureWriter(self._twin, self.pictures, self._metrics, context)
         with await self._streams.hold(context):
             async with self._streams.opened(context) as stream:
-                await writer.serve(stream, subscription, access.covers)
+                await writer.serve(stream, subscription, access.covers, access.may_see)
 
     async def Objects(  # type: ignore[override]  # noqa: N802
         self, request: pb.ObjectsRequest, context: AnyContext
@@ -324,13 +327,18 @@ class _MailboxWriter(ABC):
         self._arrived = asyncio.Event()
 
     async def serve(
-        self, stream: ConsumerStream, subscription: Subscription, covers: Covers
+        self,
+        stream: ConsumerStream,
+        subscription: Subscription,
+        covers: Covers,
+        may_see: str = "",
     ) -> None:
-        """Write entries until the stream is over."""
+        """Write entries until the stream is over; ``may_see``: as in ``ConsumerAccess``."""
         mailbox = self._twin.watch(subscription, self._arrived.set, covers)
         try:
             # From here on every missed picture is counted.
-            await self._context.send_initial_metadata(())
+            stated = ((MAY_SEE, may_see),) if may_see else ()
+            await self._context.send_initial_metadata(stated)
             while not stream.is_draining:
                 work = self._next(mailbox)
                 if work is None:

@@ -16,13 +16,16 @@ A profile is a TOML file with a table for each direction and, in it, for each im
     at_s = [[10.0, 2.0]]
     [downlink]
     rate_mbps = 20.0
+    loss_percent = 1.0          # packets that are lost, in either direction on its own
+    loss_burst = 2.0            # lost in a row on average; 1 (each by itself) unless given
     [connection_loss]
-    mean_life_s = 30.0          # connections are cut at random: a TCP proxy can lose no packets
+    mean_life_s = 30.0          # connections are cut at random
 
 ``delivery_times`` runs a plan without waiting, for experiments. Its sizes are packet bytes (pose +
 header + payload), as the paper's tau has them; the proxy on real sockets counts wire bytes instead.
 
-Two impairments are computed, outages and jitter; recorded ones are in ``rfcore.link.traces``.
+Two impairments are computed, outages and jitter; recorded ones are in ``rfcore.link.traces``. Lost
+packets are a matter of their own: TCP sends them again (``rfcore.link.lossy``).
 
 *Outage*: nothing gets through, as in a tunnel, during a handover or in a dead spot. The
 transmission stands still, and so does a trace; what is in propagation arrives. Afterwards it goes
@@ -48,6 +51,7 @@ from random import Random
 from typing import Any, Protocol
 
 from rfcore.errors import InvalidData, InvalidInput
+from rfcore.link.lossy import MAX_LOSS_PERCENT, LossyLink, PacketLoss
 from rfcore.link.shaper import (
     MAX_DELAY_S,
     MAX_RATE_BPS,
@@ -231,6 +235,9 @@ IMPAIRMENTS = ("outage", "delay_trace", "jitter")
 """In the order in which they act, whatever the order in the file; a trace is in place of a rate."""
 
 
+NO_LOSS = PacketLoss(0.0)
+
+
 class Impairment(Protocol):
     """One impairment, as a profile declares it."""
 
@@ -249,13 +256,24 @@ class DirectionPlan:
     profile: LinkProfile
     impairments: tuple[Impairment, ...] = ()
     seed: str = ""
+    loss: PacketLoss | None = None
 
     def link(self, origin_s: float = 0.0) -> Link[Any]:
-        """Return the machine; traces, outages and the like begin at ``origin_s``."""
+        """Return the machine without loss; traces, outages and the like begin at ``origin_s``."""
         parts = LinkParts(ConstantRate(self.profile.rate_bps))
         for impairment in self.impairments:
             parts = impairment.apply(parts, Random(f"{self.seed}/{impairment.name}"))
         return Link(self.profile, parts, origin_s)
+
+    def lossy_link(self, back: DirectionPlan, origin_s: float = 0.0) -> LossyLink[Any]:
+        """Return the machine with loss; acknowledgements take the way ``back``."""
+        lost, lost_back = ((plan.loss or NO_LOSS).losses for plan in (self, back))
+        return LossyLink(
+            self.link(origin_s),
+            lost(Random(f"{self.seed}/loss")),
+            back.profile.delay_s,
+            lost_back(Random(f"{self.seed}/loss of acknowledgements")),
+        )
 
     def unbounded(self) -> DirectionPlan:
         """Return the plan with a queue that never fills: for schedules that nobody can hold."""
@@ -272,11 +290,40 @@ class LinkPlan:
     seed: str = ""
     description: str = ""
 
+    @property
+    def is_lossy(self) -> bool:
+        """Whether packets are lost in a direction."""
+        return self.uplink.loss is not None or self.downlink.loss is not None
+
+    def with_loss(self, loss: PacketLoss) -> LinkPlan:
+        """Return the plan with this loss in both directions."""
+        uplink, downlink = (replace(way, loss=loss) for way in (self.uplink, self.downlink))
+        return replace(self, uplink=uplink, downlink=downlink)
+
+    def described(self) -> str:
+        """Return the link in a few words: rates, delays, what is lost and what else is done."""
+        return "; ".join(
+            [
+                f"up {_described(self.uplink)}",
+                f"down {_described(self.downlink)}",
+                *([f"connections cut every {self.mean_life_s:g} s"] if self.mean_life_s else []),
+            ]
+        )
+
     def connection_lives_s(self) -> Iterator[float] | None:
         """Return the seconds after which one connection after another is cut; None: never."""
         if self.mean_life_s is None:
             return None
         return _exponential(self.mean_life_s, Random(f"{self.seed}/connection_loss"))
+
+
+def _described(way: DirectionPlan) -> str:
+    profile = way.profile
+    words = [f"{profile.rate_bps / 1e6:g} Mbit/s", f"{1e3 * profile.delay_s:g} ms"]
+    if way.loss is not None:
+        burst = f" in bursts of {way.loss.burst:g}" if way.loss.burst > 1 else ""
+        words.append(f"{way.loss.percent:g} % of packets lost{burst}")
+    return ", ".join([*words, *(impairment.name for impairment in way.impairments)])
 
 
 def _exponential(mean: float, random: Random) -> Iterator[float]:
@@ -299,6 +346,8 @@ def delivery_times(link: LinkProfile | DirectionPlan, schedule: Iterable[Arrival
     ``InvalidInput`` when the schedule is not in time order.
     """
     plan = DirectionPlan(link) if isinstance(link, LinkProfile) else link
+    if plan.loss is not None:
+        raise InvalidInput("link.loss", f"{plan.loss.percent} %: lossy_link() needs the way back")
     machine = plan.unbounded().link()
     times: list[float] = []
     previous_s = float("-inf")
@@ -362,9 +411,13 @@ def _direction(table: Table, folder: Path, seed: str) -> DirectionPlan:
     delay_ms = table.number("delay_ms", Range(0.0, 1e3 * MAX_DELAY_S), 0.0)
     queue_kib = table.number("queue_kib", Range(1, MAX_QUEUE_KIB), 64)
     impairments += [_impairment(name, table, folder) for name in IMPAIRMENTS if name in table]
+    loss = None
+    if "loss_percent" in table:
+        percent = table.number("loss_percent", Range(0.0, MAX_LOSS_PERCENT))
+        loss = PacketLoss(percent, table.number("loss_burst", Range(1.0, 1000.0), 1.0))
     table.finish("rate_mbps", "trace", *IMPAIRMENTS)
     profile = LinkProfile(rate_bps, delay_ms / 1e3, int(queue_kib * 1024))
-    return DirectionPlan(profile, tuple(impairments), seed)
+    return DirectionPlan(profile, tuple(impairments), seed, loss)
 
 
 def _impairment(name: str, table: Table, folder: Path) -> Any:

@@ -110,6 +110,10 @@ class LinkParts:
         return replace(self, delays=(*self.delays, delay))
 
 
+class Connection:
+    """Stands for a connection through a link; one that is gone is forgotten."""
+
+
 class Link(Generic[Item]):
     """A first-in first-out link that loses and reorders nothing.
 
@@ -153,8 +157,16 @@ class Link(Generic[Item]):
         """Return when the packet in front leaves the queue, or None when none waits."""
         return self._sending[0].end_s if self._sending else None
 
-    def push(self, item: Item, size_bytes: int, now: float) -> Delivery[Item]:
+    def push(
+        self,
+        item: Item,
+        size_bytes: int,
+        now: float,
+        connection: Connection | None = None,  # noqa: ARG002
+    ) -> Delivery[Item]:
         """Accept ``item`` at ``now`` and return when it will be transmitted and delivered.
+
+        Connections share the link first come first served, so which one it is does not matter.
 
         Raises ``InvalidInput`` for a negative size, and when the link is full: a link drops
         nothing, so its driver has to hold the sender back (see ``is_full``). An empty packet, which

@@ -79,20 +79,52 @@ class Address:
 
 
 HANDSHAKE_TIMEOUT_S = 2.0
+RENEW = "make new ones (rfedge certs init --replace)"
+REMEDIES = {
+    9: "set both clocks",  # X509_V_ERR_CERT_NOT_YET_VALID
+    10: RENEW,  # X509_V_ERR_CERT_HAS_EXPIRED
+    62: "make one for this host (rfedge certs init --replace --hosts)",  # ..._HOSTNAME_MISMATCH
+    64: "make one for this host (rfedge certs init --replace --hosts)",  # ..._IP_ADDRESS_MISMATCH
+}
+OTHER_AUTHORITY = "both ends need certificates and --tls-ca of one authority (rfedge certs add)"
+"""What to do about a certificate that is refused, by OpenSSL's code; ``OTHER_AUTHORITY`` else."""
 NOT_TLS = frozenset({"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "PACKET_LENGTH_TOO_LONG"})
 """How OpenSSL calls an answer that is not a TLS record."""
 
 
-def check_handshake(address: Address, tls: TlsFiles | None) -> None:
-    """Raise ``AccessDenied`` if the two ends refuse each other; nobody listening is no refusal."""
+def check_handshake(address: Address, tls: TlsFiles | None) -> str:
+    """Make one connection; return why there is none, or "" where there is one.
+
+    Raises ``AccessDenied`` if the two ends refuse each other: waiting does not help.
+    """
     try:
-        with socket.create_connection((address.host, address.port), HANDSHAKE_TIMEOUT_S) as plain:
+        plain = socket.create_connection((address.host, address.port), HANDSHAKE_TIMEOUT_S)
+    except OSError as error:
+        return _why_unreachable(address, error)
+    try:
+        with plain:
             if tls is None:
                 _check_plaintext(address, plain)
             else:
                 _check_tls(address, plain, tls)
-    except OSError:
-        return  # no server there, not yet, or one that does not answer: the caller goes on waiting
+    except TimeoutError:
+        return f"{address} takes connections and says nothing: is that a mec-server?"
+    except OSError as error:
+        return f"{address} breaks the connection off ({error.strerror or error})"
+    return ""
+
+
+def _why_unreachable(address: Address, error: OSError) -> str:
+    if isinstance(error, socket.gaierror):
+        return f"DNS knows no {address.host} ({error.strerror}): check the name"
+    if isinstance(error, ConnectionRefusedError):
+        return f"refused: nobody listens at {address}; is mec-server running there?"
+    if isinstance(error, TimeoutError):
+        return (
+            f"timeout: {address} does not answer within {HANDSHAKE_TIMEOUT_S:g} s; check address "
+            "and firewall"
+        )
+    return f"{address} cannot be reached: {error.strerror or error}"
 
 
 def _check_tls(address: Address, plain: socket.socket, tls: TlsFiles) -> None:
@@ -101,20 +133,25 @@ def _check_tls(address: Address, plain: socket.socket, tls: TlsFiles) -> None:
             welcome = secure.recv(1)
     except ssl.SSLCertVerificationError as error:
         raise AccessDenied(
-            f"the certificate of {address} is refused: {error.verify_message} "
+            f"the certificate of {address} is refused: {_and_remedy(error)} "
             f"(trusted: {tls.authority})"
         ) from error
     except ssl.SSLError as error:
         if error.reason in NOT_TLS:
             raise AccessDenied(
-                f"{address} speaks plaintext; start mec-server with --tls-cert, or leave it out"
+                f"{address} speaks plaintext; start mec-server with --tls-cert, --tls-key and "
+                "--tls-ca, or leave them out here"
             ) from error
         if "ALERT" not in (error.reason or ""):
             raise
         welcome = b""
     if not welcome:
-        problem = own_problem(tls) or "it does not know its authority, or other clocks are wrong"
+        problem = own_problem(tls) or f"it does not know its authority; {OTHER_AUTHORITY}"
         raise AccessDenied(f"{address} refuses {tls.certificate}: {problem}")
+
+
+def _and_remedy(error: ssl.SSLCertVerificationError) -> str:
+    return f"{error.verify_message}; {REMEDIES.get(error.verify_code, OTHER_AUTHORITY)}"
 
 
 def own_problem(tls: TlsFiles) -> str:
@@ -140,7 +177,7 @@ def own_problem(tls: TlsFiles) -> str:
             with suppress(ssl.SSLWantReadError):
                 end.do_handshake()
     except ssl.SSLCertVerificationError as error:
-        return error.verify_message
+        return _and_remedy(error)
     return ""
 
 
@@ -150,5 +187,11 @@ def _check_plaintext(address: Address, plain: socket.socket) -> None:
     context.set_alpn_protocols(["h2"])
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
-    with context.wrap_socket(plain):
-        raise AccessDenied(f"{address} wants TLS; give --tls-cert, --tls-key and --tls-ca")
+    try:
+        with context.wrap_socket(plain):
+            pass
+    except ssl.SSLError as error:
+        if error.reason in NOT_TLS:
+            return
+        raise
+    raise AccessDenied(f"{address} wants TLS; give --tls-cert, --tls-key and --tls-ca")

@@ -20,6 +20,9 @@ server lets two processes never send the same camera; without it the connection 
 VEHICLE: Final = "rfedge-vehicle"
 """Metadata of a stream and of calls for lists and archives: the vehicle's id, as in its Hello."""
 
+MAY_SEE: Final = "rfedge-may-see"
+"""Initial metadata of ``TwinService.Watch``: what the caller may see, if that is not everything."""
+
 TILE: Final = "rfedge-tile"
 """Metadata of a stream: the name of the tile it is for. A proxy may place streams by this and by
 ``VEHICLE`` before it has seen a message (docs/how-to/servers.md); a server believes neither."""
@@ -48,6 +51,10 @@ SHARED_OPTIONS: Final[Options] = (
     ("grpc.default_compression_algorithm", 0),
 )
 
+RECONNECT_S: Final = 0.5
+"""Longest pause before a client connects again. With jitter and the greeting a whole second would
+miss the promised one."""
+
 CHANNEL_OPTIONS: Final[Options] = (
     *SHARED_OPTIONS,
     # A silent partition is noticed in 1.3 s; with the defaults not within 25 s.
@@ -55,10 +62,9 @@ CHANNEL_OPTIONS: Final[Options] = (
     ("grpc.keepalive_timeout_ms", 1_000),
     ("grpc.keepalive_permit_without_calls", 1),
     ("grpc.http2.max_pings_without_data", 0),
-    # After an outage the stream is back in half a second instead of 2.7 s. The longest wait is
-    # half a second, since with jitter and the greeting a whole one would miss the promised second.
+    # After an outage the stream is back in half a second instead of 2.7 s.
     ("grpc.initial_reconnect_backoff_ms", 100),
-    ("grpc.max_reconnect_backoff_ms", 500),
+    ("grpc.max_reconnect_backoff_ms", round(1e3 * RECONNECT_S)),
     # Despite its name, how long one attempt may take (20 s by default). Two seconds let links of
     # half a second of round trip in; 100 ms would shut them out for ever.
     ("grpc.min_reconnect_backoff_ms", 2_000),

@@ -8,14 +8,15 @@ in plaintext only on this machine unless that is allowed. What goes wrong is an 
 from __future__ import annotations
 
 import threading
-from collections.abc import AsyncIterator, Callable, Generator
+import time
+from collections.abc import AsyncIterator, Callable, Generator, Iterable
 from types import TracebackType
 
 import grpc
 
 from rfcore.errors import AccessDenied, RfedgeError
 from rfcore.wire.address import Address, check_handshake
-from rfcore.wire.conventions import CONSUMER_OPTIONS
+from rfcore.wire.conventions import CONSUMER_OPTIONS, MAY_SEE
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import (
     Departure,
@@ -37,7 +38,10 @@ from rfcore.wire.twin_render import (
 from rfcore.wire.v1 import twin_pb2_grpc
 
 CONNECT_S = 10.0
+ASK_AFTER_S = 1.0
+"""Period at which a client without a connection finds out why."""
 RENDER_TIMEOUT_S = 30.0
+Metadata = Iterable[tuple[str, str | bytes]]
 REFUSED = (
     grpc.StatusCode.PERMISSION_DENIED,
     grpc.StatusCode.UNAUTHENTICATED,
@@ -97,13 +101,16 @@ class TwinClient:
     def watch(
         self,
         subscription: Subscription | None = None,
-        connected: Callable[[], None] = lambda: None,
+        connected: Callable[[str], None] = lambda _: None,
+        problem: Callable[[str], None] = lambda _: None,
     ) -> Generator[TwinPicture | Departure, None, None]:
         """Yield pictures and departures until the server ends the stream, or ``stop``.
 
         The newest picture of each camera comes first; a reader that is slow misses pictures. By
-        default pictures of all vehicles come, as JPEG. ``connected`` is called when the server has
-        accepted the call. Raises ``RfedgeError`` if no server answers within ``CONNECT_S``.
+        default pictures of all vehicles come, as JPEG. ``connected`` is called once the server has
+        accepted the call, with what the certificate may see, "" for everything; ``problem``, on any
+        thread, with why there is no connection yet. Raises ``RfedgeError`` if no server answers
+        within ``CONNECT_S``.
         """
         request = subscription_to_wire(subscription or Subscription())
         stub = twin_pb2_grpc.TwinServiceStub(self._channel)
@@ -112,8 +119,8 @@ class TwinClient:
                 return
             self._call = call = stub.Watch(request, wait_for_ready=True)
         try:
-            self._wait_for_server(call)
-            connected()
+            self._wait_for_server(call, problem)
+            connected(_may_see(call.initial_metadata()))
             for response in call:
                 if self._stopped:
                     return
@@ -140,23 +147,38 @@ class TwinClient:
             raise twin_error(error) from error
         return rendered_view_from_wire(answer, request.camera.intrinsics)
 
-    def _wait_for_server(self, call: grpc.Call) -> None:
+    def _wait_for_server(self, call: grpc.Call, tell: Callable[[str], None]) -> None:
         """Wait until the server answers, or the call is cancelled; raise ``RfedgeError``."""
-        expired = threading.Event()
+        answered = threading.Event()
+        problems: list[RfedgeError] = []
 
-        def expire() -> None:
-            expired.set()
+        def ask() -> None:
+            problem = ""
+            end_s = time.monotonic() + CONNECT_S
+            while (left_s := end_s - time.monotonic()) > 0:
+                if answered.wait(min(ASK_AFTER_S, left_s)) or self._stopped:
+                    return
+                before = problem
+                try:
+                    problem = check_handshake(self.address, self._tls)
+                except AccessDenied as error:
+                    problems.append(error)
+                    break
+                if problem != before and not answered.is_set():
+                    tell(f"{problem} (tried again for {CONNECT_S:g} s)")
+            cause = f": {problem}" if problem else ""
+            no_server = f"no server at {self.address} within {CONNECT_S:g} s{cause}"
+            problems.append(RfedgeError(no_server))
             call.cancel()
 
-        timer = threading.Timer(CONNECT_S, expire)
-        timer.start()
+        asking = threading.Thread(target=ask, name="asking", daemon=True)
+        asking.start()
         try:
             call.initial_metadata()
         finally:
-            timer.cancel()
-        if expired.is_set() and not self._stopped:
-            check_handshake(self.address, self._tls)
-            raise RfedgeError(f"no server at {self.address} within {CONNECT_S:g} s")
+            answered.set()
+        if problems and not self._stopped:
+            raise problems[0]
 
 
 class AsyncTwinClient:
@@ -193,21 +215,27 @@ class AsyncTwinClient:
             raise RfedgeError("there is no connection to the server")
         return self._channel
 
+    def connection_problem(self) -> str:
+        """Make a connection, blocking; return why there is none, "" if there is one.
+
+        Raises ``AccessDenied`` if the ends refuse each other.
+        """
+        return check_handshake(self.address, self._tls)
+
     async def watch(
         self,
         subscription: Subscription | None = None,
-        connected: Callable[[], None] = lambda: None,
+        connected: Callable[[str], None] = lambda _: None,
     ) -> AsyncIterator[TwinPicture | Departure]:
         """Yield pictures and departures until the server ends the stream.
 
-        ``connected`` is called when the server has accepted the call.
+        ``connected`` is called once the server has accepted the call, with what may be seen.
         """
         request = subscription_to_wire(subscription or Subscription())
         stub = twin_pb2_grpc.TwinServiceStub(self.channel)
         call = stub.Watch(request, wait_for_ready=True)
         try:
-            await call.initial_metadata()
-            connected()
+            connected(_may_see(await call.initial_metadata() or ()))
             async for response in call:
                 yield twin_message_from_wire(response)
         except grpc.aio.AioRpcError as error:
@@ -225,6 +253,11 @@ class AsyncTwinClient:
             raise twin_error(error) from error
         finally:
             call.cancel()
+
+
+def _may_see(stated: Metadata) -> str:
+    """Return what a server states that the caller may see, "" for everything."""
+    return next((str(value) for key, value in stated if key == MAY_SEE), "")
 
 
 def _checked(address: str, tls: TlsFiles | None, allow_insecure: bool) -> Address:

@@ -44,6 +44,11 @@ class LinkSettings:
     """Throughput of the way back, bit/s; 4e6 without a profile."""
     delay_ms: float | None = None
     """One-way delay in either direction, ms; 20 without a profile."""
+    loss: Annotated[float | None, arg(metavar="PERCENT")] = None
+    """Share of the packets to lose in either direction, percent; also beside a profile. TCP sends
+    them again: nothing is damaged, what comes is late and less."""
+    loss_burst: Annotated[float, arg(metavar="PACKETS")] = 1.0
+    """Packets that `--loss` takes in a row, on average."""
     metrics_port: Annotated[int | None, arg(metavar="PORT")] = None
     """Port for Prometheus; 0 takes a free one, none are served without it."""
     metrics_host: Annotated[str, arg(metavar="HOST")] = "127.0.0.1"
@@ -87,11 +92,14 @@ class LinkSettings:
 
     def plan(self) -> LinkPlan:
         """Return what the link is made of; raise what reading ``profile`` raises."""
+        from rfcore.link.lossy import PacketLoss
         from rfcore.link.plan import LinkPlan, read_link
 
         if self.profile is not None:
-            return read_link(self.profile)
-        return LinkPlan(self._constant(self.uplink_bps), self._constant(self.downlink_bps))
+            plan = read_link(self.profile)
+        else:
+            plan = LinkPlan(self._constant(self.uplink_bps), self._constant(self.downlink_bps))
+        return plan.with_loss(PacketLoss(self.loss, self.loss_burst)) if self.loss else plan
 
     def _constant(self, rate_bps: float | None) -> DirectionPlan:
         from rfcore.link.plan import DirectionPlan

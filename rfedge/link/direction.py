@@ -19,8 +19,8 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from rfcore.link.plan import DirectionPlan
-from rfcore.link.shaper import BusyMeter, Link
+from rfcore.link.lossy import LossyLink
+from rfcore.link.shaper import BusyMeter, Connection, Link
 from rfcore.wire.instruments import Family, Instruments
 from rfedge.link import SPIN_S
 
@@ -48,16 +48,16 @@ class Direction:
 
     def __init__(
         self,
-        plan: DirectionPlan,
+        link: Link[Packet] | LossyLink[Packet],
         transit: Callable[[float], None] = _ignore,
         spin_s: float = SPIN_S,
     ) -> None:
         self.meter = BusyMeter()
         self.senders: set[Side] = set()
-        self.profile = plan.profile
+        self.profile = link.profile
         self._transit = transit
         self._spin_s = spin_s
-        self._link: Link[Packet] = plan.link(time.perf_counter())
+        self._link = link
         self._arrived = asyncio.Event()
         self._holding = False
 
@@ -71,10 +71,12 @@ class Direction:
         """Return the bytes in the link."""
         return self._link.held_bytes
 
-    def push(self, release: Callable[[], None], size_bytes: int) -> None:
-        """Call ``release`` when ``size_bytes`` have passed the link."""
+    def push(
+        self, release: Callable[[], None], size_bytes: int, connection: Connection | None = None
+    ) -> None:
+        """Call ``release`` when ``size_bytes`` of a connection have passed the link."""
         now = time.perf_counter()
-        self._link.push(Packet(release, now), size_bytes, now)
+        self._link.push(Packet(release, now), size_bytes, now, connection)
         self._arrived.set()
         if self._link.is_full(now):
             self._holding = True
@@ -103,11 +105,14 @@ class Direction:
 
     def _release(self, now: float) -> None:
         for delivery in self._link.pop_due(now):
-            delivery.item.release()
+            packets = delivery.item if isinstance(delivery.item, tuple) else (delivery.item,)
+            for packet in packets:
+                packet.release()
             released_s = time.perf_counter()
             self.meter.released(delivery, released_s)
             if delivery.size_bytes:
-                self._transit(released_s - delivery.item.pushed_s)
+                for packet in packets:
+                    self._transit(released_s - packet.pushed_s)
 
     def report(self) -> dict[str, float | int | None]:
         """Return what was measured."""
@@ -124,7 +129,7 @@ class Direction:
         }
 
 
-class Side(asyncio.BufferedProtocol):
+class Side(asyncio.BufferedProtocol, Connection):
     """One end of one connection: what it sends goes into ``outward``, to ``peer``."""
 
     def __init__(self, outward: Direction, ended: Callable[[], None]) -> None:
@@ -185,17 +190,17 @@ class Side(asyncio.BufferedProtocol):
         data = bytes(self._buffer[:nbytes])
         for start in range(0, nbytes, SEGMENT_BYTES):
             segment = data[start : start + SEGMENT_BYTES]
-            self._outward.push(lambda part=segment: self._deliver(part), len(segment))  # type: ignore[misc]
+            self._outward.push(lambda part=segment: self._deliver(part), len(segment), self)  # type: ignore[misc]
 
     def eof_received(self) -> bool:
         """Pass the end on behind the data; keep our own direction open."""
-        self._outward.push(self._deliver_end, 0)
+        self._outward.push(self._deliver_end, 0, self)
         return True
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
         """Take the other end down too, after what is under way."""
         self._outward.senders.discard(self)
-        self._outward.push(self._close_peer, 0)
+        self._outward.push(self._close_peer, 0, self)
         self._ended()
 
     def pause_writing(self) -> None:

@@ -1,8 +1,9 @@
 """``rfedge link``: a throughput-limited link between a real vehicle and a real server.
 
 An asyncio TCP proxy around two ``rfcore.link`` machines, one a direction, shared by all
-connections as one radio link would be. Sizes are wire bytes (HTTP/2 and all). Nothing is lost or
-reordered; when a direction holds as much as it may, its senders are not read, so TCP slows them.
+connections as one radio link would be. Sizes are wire bytes (HTTP/2 and all). Nothing is reordered;
+when a direction holds as much as it may, its senders are not read, so TCP slows them. Where packets
+are lost, TCP's sending of them is modelled, each connection's by itself (``rfcore.link.lossy``).
 
 A release that is late makes the link look slower than it is. So the command sleeps with select(),
 which is exact to the microsecond where epoll rounds up to milliseconds, and requests a real-time
@@ -19,6 +20,7 @@ import os
 import selectors
 import signal
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
@@ -45,11 +47,18 @@ class LinkProxy:
         self.addresses = [listen for listen, _ in settings.paths()]
         self._settings = settings
         plan = settings.plan()
+        self.described = plan.described()
         self._lives = plan.connection_lives_s()
         self.registry = CollectorRegistry()
         self._metrics = LinkMetrics(self.registry)
-        self._up = Direction(plan.uplink, self._metrics.transit("up"), settings.spin_s)
-        self._down = Direction(plan.downlink, self._metrics.transit("down"), settings.spin_s)
+        up, down, now = plan.uplink, plan.downlink, time.perf_counter()
+        machines = (
+            (up.lossy_link(down, now), down.lossy_link(up, now))
+            if plan.is_lossy
+            else (up.link(now), down.link(now))
+        )
+        self._up = Direction(machines[0], self._metrics.transit("up"), settings.spin_s)
+        self._down = Direction(machines[1], self._metrics.transit("down"), settings.spin_s)
         self._metrics.observe({"up": self._up, "down": self._down})
         self._connections = 0
         self._connections_cut = 0
@@ -177,6 +186,9 @@ async def _run(settings: LinkSettings) -> None:
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     proxy = LinkProxy(settings)
     await proxy.start()
+    for address, (_, to) in zip(proxy.addresses, settings.paths(), strict=True):
+        print(f"listening on {address}, to {to}", flush=True)
+    print(proxy.described, flush=True)
     await stopped.wait()
     await proxy.stop()
 

@@ -283,8 +283,16 @@ class NatsPictures:
         self._is_connected = False
         self._detail = ""
 
-    def watch(self, subscription: Subscription) -> Generator[TwinMessage, None, None]:
-        """Yield what arrives until ``stop``; raise ``RfedgeError`` if there is no NATS at first."""
+    def watch(
+        self,
+        subscription: Subscription,
+        connected: Callable[[str], None] = lambda _: None,
+        problem: Callable[[str], None] = lambda _: None,  # noqa: ARG002
+    ) -> Generator[TwinMessage, None, None]:
+        """Yield what arrives until ``stop``; raise ``RfedgeError`` if there is no NATS at first.
+
+        ``connected`` is called once there is one; the error says why there is none.
+        """
         with asyncio.Runner() as runner:
             loop, arrived = runner.get_loop(), asyncio.Event()
             with self._lock:
@@ -292,6 +300,7 @@ class NatsPictures:
             reader = NatsReader(self._servers, subscription, self._take, self._say)
             reading = loop.create_task(reader.run())
             runner.run(self._until_connected(reading, arrived))
+            connected("")
             while not self._stopped:
                 if not self._waiting:
                     runner.run(_until(reading, arrived))

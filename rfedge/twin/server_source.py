@@ -10,6 +10,7 @@ import asyncio
 import time
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ from cav_agent.field_fetch import fetch_field
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
 from rfcore.field import FieldStore
 from rfcore.perception.objects import CameraKey
+from rfcore.wire.conventions import RECONNECT_S
 from rfcore.wire.tiles import LearntLight, Tile, TileLight, learnt_of, tile_of
 from rfcore.wire.twin import Departure, TwinPicture
-from rfcore.wire.twin_client import AsyncTwinClient
+from rfcore.wire.twin_client import ASK_AFTER_S, AsyncTwinClient
 from rfcore.wire.twin_render import (
     NO_AGE,
     ObjectsRequest,
@@ -73,6 +75,7 @@ class ServerSource:
         self._store = FieldStore(folder)
         self._cameras: set[CameraKey] = set()
         self._showing_objects = 0
+        self._is_connected = asyncio.Event()
 
     @property
     def live(self) -> ServerSource:
@@ -86,7 +89,7 @@ class ServerSource:
             objects = asyncio.create_task(self._follow_objects())
             try:
                 while True:
-                    problem = await self._watch()
+                    problem = await self._watch_explained()
                     self._show_state("waiting", problem)
                     await asyncio.sleep(RETRY_S)
             finally:
@@ -134,11 +137,46 @@ class ServerSource:
     def _show_state(self, state: str, detail: str) -> None:
         self._scene.connection(state, detail, self._clock())
 
+    def _connected(self, may_see: str) -> None:
+        self._is_connected.set()
+        address = str(self._client.address)
+        log.info("connected", server=address, may_see=may_see or "everything")
+        limits = f"; this certificate may see: {may_see}" if may_see else ""
+        self._show_state("connected", address + limits)
+
+    async def _watch_explained(self) -> str:
+        """As ``_watch``; until there is a connection, say why; raise ``AccessDenied``."""
+        self._is_connected.clear()
+        watching = asyncio.create_task(self._watch())
+        explaining = asyncio.create_task(self._explain())
+        try:
+            await asyncio.wait({watching, explaining}, return_when=asyncio.FIRST_COMPLETED)
+            if explaining.done():
+                explaining.result()
+            return await watching
+        finally:
+            watching.cancel()
+            explaining.cancel()
+            await asyncio.gather(watching, explaining, return_exceptions=True)
+
+    async def _explain(self) -> None:
+        before = ""
+        while not self._is_connected.is_set():
+            with suppress(TimeoutError):
+                async with asyncio.timeout(ASK_AFTER_S):
+                    await self._is_connected.wait()
+                    return
+            problem = await asyncio.to_thread(self._client.connection_problem)
+            if problem and problem != before:
+                log.warning("no connection", problem=problem, again_in_s=RECONNECT_S)
+                self._show_state("waiting", problem)
+            before = problem
+
     async def _watch(self) -> str:
         """Show pictures until the stream ends; return the reason."""
         address = str(self._client.address)
         self._show_state("waiting", f"connecting to {address}")
-        messages = self._client.watch(connected=lambda: self._show_state("connected", address))
+        messages = self._client.watch(connected=self._connected)
         try:
             async for message in messages:
                 self._take(message)

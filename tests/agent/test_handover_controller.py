@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from prometheus_client import CollectorRegistry
+from structlog.testing import capture_logs
 
 from cav_agent.capture_schedule import recorded_schedule
 from cav_agent.client import CameraTaken, StreamOwner
@@ -38,6 +39,7 @@ class MemoryClient:
 
     rate_limit_hz = 0.0
     is_draining = False
+    waits_for = ""
 
     def __init__(
         self,
@@ -201,6 +203,21 @@ async def test_every_picture_goes_to_the_tile_it_was_taken_on(drive: Drive, site
     await drive(WEST, EAST).run()
     assert site.captured(WEST) == [0, 1]
     assert site.captured(EAST) == [2, 3]
+
+
+async def test_a_field_that_does_not_come_is_named_as_what_the_drive_waits_for(
+    drive: Drive, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cav_agent.handover_controller.FIRST_S", 0.0)
+    monkeypatch.setattr(site, "prepare", lambda _: asyncio.get_running_loop().create_future())
+    with capture_logs() as logs:
+        running = asyncio.create_task(drive(WEST).run())
+        while not logs:
+            await asyncio.sleep(0)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+    assert logs[0]["event"] == "waiting"
+    assert logs[0]["what"] == f"field {WEST.tile.field_id} of tile tile-0"
 
 
 async def test_a_handover_is_counted_and_closes_the_stream_that_was_left(

@@ -1,16 +1,18 @@
 """The connection to a server: checked before use, and honest about who does not answer."""
 
+import socket
 from dataclasses import replace
 from pathlib import Path
 
 import grpc
 import pytest
+from structlog.testing import capture_logs
 
 from cav_agent.config import AgentConfig
 from cav_agent.server_connection import ServerConnection, server_connections
 from rfcore.errors import InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.address import Address
-from rfcore.wire.conventions import VEHICLE
+from rfcore.wire.conventions import RECONNECT_S, VEHICLE
 from rfcore.wire.tiles import MAX_TILES
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceServicer, add_FieldServiceServicer_to_server
@@ -86,6 +88,27 @@ async def test_a_server_that_is_not_there_is_named_with_the_time_waited() -> Non
             await connection.require(0.05)
         with pytest.raises(RfedgeError, match=r"no server at 127\.0\.0\.1:1 within 0\.05 s"):
             await connection.published_tiles(0.05)
+
+
+@pytest.mark.parametrize(
+    ("address", "cause"),
+    [("127.0.0.1:1", "refused"), ("nowhere.invalid:1", "DNS"), ("silent", "says nothing")],
+)
+async def test_a_connection_that_fails_is_logged_once_with_its_cause(
+    address: str, cause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cav_agent.server_connection.ASK_AFTER_S", 0.02)
+    monkeypatch.setattr("rfcore.wire.address.HANDSHAKE_TIMEOUT_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as silent, capture_logs() as logs:
+        if address == "silent":
+            address = f"127.0.0.1:{silent.getsockname()[1]}"
+        async with ServerConnection(Address.parse("server", address), None, "cav-1") as connection:
+            with pytest.raises(RfedgeError, match=cause):
+                await connection.require(1.0)
+    (line,) = logs
+    assert (line["event"], line["server"]) == ("no connection", address)
+    assert cause in line["problem"]
+    assert line["again_in_s"] == RECONNECT_S
 
 
 async def test_a_server_without_tiles_publishes_its_only_field_everywhere() -> None:

@@ -135,6 +135,20 @@ def test_nothing_is_encoded_before_welcome_and_credit(
     assert session.job_to_start(0.0) is not None
 
 
+def test_what_a_picture_waits_for_is_known(hello: Hello, make_capture: MakeCapture) -> None:
+    session = AgentSession(hello)
+    assert session.waits_for == "", "no connection is the connection's to tell"
+    session.connected(0.0)
+    assert "welcome" in session.waits_for
+    session.receive(Welcome("s-1", exact=True), 0.0)
+    assert session.waits_for == "", "there is no picture"
+    session.offer(make_capture(0))
+    assert "credit" in session.waits_for
+    session.receive(Credit("front", 2), 0.0)
+    assert session.job_to_start(0.0) is not None
+    assert "encoder" in session.waits_for
+
+
 # --- pictures and credits
 
 

@@ -43,7 +43,7 @@ PICTURES = 12
 @contextmanager
 def lossy_wire(near: str, far: str, subnet: str, *numbers: float) -> Iterator[None]:
     """Connect two namespaces; ``numbers`` are loss in percent, RTT in ms and Mbit/s."""
-    words = [sys.executable, "-m", "fault.lossy_wire", near, far, subnet, *map(str, numbers)]
+    words = [sys.executable, "-m", "lab.tcp.wire", near, far, subnet, *map(str, numbers)]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, env=ENVIRONMENT)
     assert process.stdout is not None
     with process:

@@ -1,6 +1,7 @@
 """Certificates on a live server: revoked, expired, granted less; connections of a great age."""
 
 import asyncio
+import threading
 from contextlib import AsyncExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -18,6 +19,7 @@ from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import Subscription, twin_message_from_wire
+from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.twin_render import (
     ObjectsRequest,
     ViewRequest,
@@ -47,6 +49,36 @@ async def status_of_watch(address: object, tls: TlsFiles, *names: str) -> grpc.S
         subscription = Subscription(frozenset(names))
         call = watch_call(channel, subscription)
         return await call.code()
+
+
+@pytest.mark.parametrize(
+    ("granted", "may_see"),
+    [
+        ('tiles = ["west"]', "nothing (this server has no tile west)"),
+        ('vehicles = ["cav-2"]', "vehicle cav-2"),
+        ("all = true", ""),
+    ],
+)
+async def test_a_watcher_is_told_what_its_certificate_may_see(
+    granted: str, may_see: str, certs: Files, serve: Any, tmp_path: Path
+) -> None:
+    access, told, heard = tmp_path / "access.toml", list[str](), threading.Event()
+    access.write_text(f"[consumers.desk]\n{granted}")
+
+    def connected(text: str) -> None:
+        told.append(text)
+        heard.set()
+
+    async with serve(tls=certs("server"), access=access) as server:
+        client = TwinClient(str(server.address), certs("consumer-desk"))
+        watching = asyncio.create_task(
+            asyncio.to_thread(lambda: list(client.watch(connected=connected)))
+        )
+        assert await asyncio.to_thread(heard.wait, 15.0)
+        client.stop()
+        await watching
+        client.close()
+    assert told == [may_see]
 
 
 @pytest.mark.usefixtures("swift")

@@ -19,6 +19,7 @@ from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin_client import TwinClient
 from rfedge.certs import Members, certify, write_certificates
+from rfedge.cli.services import CertsAdd, CertsInit
 
 SOON = AgentLimits(give_up_s=5.0)
 
@@ -76,8 +77,8 @@ async def test_an_expired_vehicle_is_told_so_in_one_line(
     async with serve(tls=replace(new, authority=both)) as server:
         with pytest.raises(AccessDenied) as caught:
             await travel(server.address, tls=replace(old, authority=both))
-    refused = f"{server.address} refuses {old.certificate}: certificate has expired"
-    assert str(caught.value) == refused
+    refused = f"{server.address} refuses {old.certificate}: certificate has expired; make new"
+    assert str(caught.value).startswith(refused)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +111,33 @@ async def test_a_server_that_is_not_trusted_gets_nothing_and_the_vehicle_says_wh
     made: dict[str, Files] = {}
     async with serve(tls=files(server_has)) as server:
         with pytest.raises(AccessDenied, match=problem):
-            await travel(server.address, tls=files(vehicle_has), limits=SOON)
+            await travel(server.address, tls=files(vehicle_has))
+
+
+@pytest.mark.parametrize("wrong", ["expired", "authority", "host"])
+async def test_what_a_refusal_says_to_do_helps(
+    wrong: str, serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    mine, theirs = tmp_path / "mine", tmp_path / "theirs"
+    there = Members(("cav-2",) if wrong == "authority" else ("cav-1",), ("watch",))
+    if wrong == "host":
+        there = replace(there, hosts=("elsewhere.example",))
+    files = certificates(theirs, there, age_days=60 if wrong == "expired" else 0)
+    vehicle = certificates(mine, Members(("cav-1",), ()))("vehicle-cav-1")
+    if wrong != "authority":
+        vehicle = files("vehicle-cav-1")
+    async with serve(tls=files("server")) as server:
+        with pytest.raises(AccessDenied) as caught:
+            await travel(server.address, tls=vehicle)
+    said = str(caught.value)
+    if "rfedge certs add" in said:
+        CertsAdd(theirs, vehicles=("cav-1",), days=20).run()
+    else:
+        assert "rfedge certs init --replace" in said
+        assert ("--hosts" in said) == (wrong == "host")
+        CertsInit(theirs, replace=True).run()
+    async with serve(tls=files("server")) as server:
+        assert (await travel(server.address, tls=files("vehicle-cav-1"))).counts == {"acked": 6}
 
 
 async def test_a_vehicle_of_another_authority_is_refused_by_the_server(

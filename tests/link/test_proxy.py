@@ -3,6 +3,9 @@
 import asyncio
 import errno
 import json
+import re
+import socket
+import subprocess
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -11,11 +14,12 @@ from typing import Any
 import pytest
 
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.link.plan import DirectionPlan
-from rfcore.link.shaper import LinkProfile
+from rfcore.link.lossy import PacketLoss
+from rfcore.link.shaper import Link, LinkProfile
 from rfedge.link import LinkSettings
 from rfedge.link.direction import Direction, Side
 from rfedge.link.proxy import LinkProxy
+from rfedge.processes import command_of
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 FAST: dict[str, float] = {"uplink_bps": 1e9, "downlink_bps": 1e9, "delay_ms": 0.0}
@@ -133,7 +137,7 @@ async def test_an_end_that_vanished_unheard_leaves_the_link_to_the_others() -> N
         def write_eof(self) -> None:
             raise OSError(errno.ENOTCONN, "Transport endpoint is not connected")
 
-    direction = Direction(DirectionPlan(LinkProfile(1e9)))
+    direction = Direction(Link(LinkProfile(1e9)))
     here, gone = (Side(direction, lambda: None) for _ in range(2))
     here.peer, gone.transport = gone, Vanished()
     pump = asyncio.create_task(direction.pump())
@@ -228,6 +232,42 @@ async def test_two_paths_share_one_link() -> None:
         await writer.wait_closed()
         assert proxy.report()["uplink"]["bytes"] == len(b"firstsecond")
     other.close()
+
+
+async def test_lost_packets_cost_time_and_no_byte() -> None:
+    data = bytes(i % 251 for i in range(60_000))
+    async with linked(echo, uplink_bps=8e6, downlink_bps=8e6, delay_ms=5.0, loss=5.0) as proxy:
+        assert await exchange(proxy, data) == data
+    report = proxy.report()
+    sent_again = (
+        report["uplink"]["bytes"] + report["downlink"]["bytes"] - 2 * len(data) * 1500 / 1448
+    )
+    assert sent_again > 1448
+
+
+def test_loss_goes_with_a_profile(profile: Callable[..., Path]) -> None:
+    plan = LinkSettings("127.0.0.1:1", profile=profile(), loss=2.0, loss_burst=3.0).plan()
+    assert plan.uplink.loss == plan.downlink.loss == PacketLoss(2.0, 3.0)
+
+
+def test_the_command_says_at_once_where_it_listens_also_through_a_pipe() -> None:
+    """The form of the guides, --to alone; what connects there reaches the server."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        to = f"127.0.0.1:{server.getsockname()[1]}"
+        command = [*command_of("rfedge"), "link", "--to", to]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as link:
+            try:
+                assert link.stdout is not None
+                listening, address, end = re.split(r"on |,", link.stdout.readline().strip())
+                assert (listening, end) == ("listening ", f" to {to}")
+                near = socket.create_connection(address.split(":"), 10)
+                near.sendall(b"through")
+                near.shutdown(socket.SHUT_WR)
+                far, _ = server.accept()
+                with near, far:
+                    assert far.recv(100) == b"through"
+            finally:
+                link.kill()
 
 
 def test_a_path_needs_both_its_ends() -> None:

@@ -1,7 +1,7 @@
 """A wire between network namespaces that loses and delays IP packets, at a limited rate.
 
 Two TUN devices with this process between them, so the kernels' own TCP meets the loss, as it does
-on a road: ``python -m fault.lossy_wire NEAR FAR SUBNET LOSS_PERCENT RTT_MS RATE_MBPS``. The near
+on a road: ``python -m lab.tcp.wire NEAR FAR SUBNET LOSS_PERCENT RTT_MS RATE_MBPS``. The near
 end gets the address SUBNET.1, the far one SUBNET.2. Losses are independent, of a given seed; both
 directions are alike; a full queue (64 KiB) drops what comes.
 """
@@ -93,7 +93,7 @@ def main(near: str, far: str, subnet: str, loss_percent: str, rtt_ms: str, rate_
     place(names[1], far, f"{subnet}.2", f"{subnet}.1")
     print("ready", flush=True)
     profile = LinkProfile(1e6 * float(rate_mbps), float(rtt_ms) / 2e3)
-    forward(*ends, float(loss_percent) / 100, profile)
+    forward(ends[0], ends[1], float(loss_percent) / 100, profile)
 
 
 if __name__ == "__main__":
