@@ -12,13 +12,14 @@ import tyro
 from cav_agent.config import AgentConfig
 from cav_agent.vehicle import Vehicle
 from rfcore.errors import RfedgeError
-from rfcore.wire.settings import OPTIONS, configure_logs
+from rfcore.wire.settings import OPTIONS, configure_logs, words_of_command_line
 
 
 def main() -> None:
     """Parse the command line and drive; exit 2 with one line when it cannot be done."""
     try:
-        config = tyro.cli(AgentConfig, config=OPTIONS, prog="cav-agent")
+        words = words_of_command_line(sys.argv[1:])
+        config = tyro.cli(AgentConfig, config=OPTIONS, prog="cav-agent", args=words)
         configure_logs(sys.stderr, config.log)
         config.render.check()
         asyncio.run(drive(config))

@@ -14,7 +14,8 @@ from cav_agent.pose_feed.sources import PoseFeedSettings
 from rfcore.codec.h264.config import CRF_RANGE, CoderSettings
 from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.errors import InvalidInput
-from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
+from rfcore.named_class import is_named_class
+from rfcore.wire.settings import CONFIG, LogForm, MetricsSettings, RenderSettings, TransportSettings
 from rfcore.wire.values import check_field_id, check_name
 
 
@@ -80,7 +81,8 @@ class AgentConfig:
     """realtime: capture at the rate, drop what the link cannot take. lockstep: capture the next
     picture when the previous was answered."""
     field: str | None = None
-    """Field id (sha256); without it, what servers publish or the only field they have."""
+    """Field id (sha256), or MODULE:CLASS of a class of your own that renders it
+    (docs/how-to/python.md); without it, what servers publish or the only field they have."""
     vehicle: str = "cav-1"
     """Name of the vehicle on the wire."""
     allow_recording: bool = False
@@ -110,6 +112,8 @@ class AgentConfig:
     live: LiveSettings = LiveSettings()
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
+    config: Annotated[Path | None, CONFIG] = None
+    """Take options from this TOML file, too: KEY = VALUE, as rate = 5. The command line wins."""
     report: Path | None = None
     """File for one JSON line per picture."""
     render: RenderSettings = RenderSettings()
@@ -127,7 +131,7 @@ class AgentConfig:
             raise InvalidInput("mask", "the masks of a rig stand in its file")
         check_name("camera", self.camera)
         check_name("vehicle", self.vehicle)
-        if self.field is not None:
+        if self.field is not None and not is_named_class(self.field):
             check_field_id("field", self.field)
         if not 0.01 <= self.rate <= 1000:
             raise InvalidInput("rate", f"{self.rate} Hz is outside 0.01..1000 Hz")

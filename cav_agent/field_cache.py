@@ -31,6 +31,7 @@ from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.sender.ladder import MeasuredRung, Rung, read_ladder
 from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
 from rfcore.field import FULL, FieldStore, RadianceField
+from rfcore.field.own import OwnField
 from rfcore.field.store import decode_beginning
 from rfcore.wire.tiles import Tile
 
@@ -73,6 +74,7 @@ class FieldCache:
     """Prepares fields by tile and keeps the last ``MAX_PREPARED``; tiles of one field share it.
 
     A field that is not in the local store is fetched from ``servers[i]``, which publishes the tile.
+    ``own`` stands for every field.
     """
 
     def __init__(
@@ -81,9 +83,11 @@ class FieldCache:
         servers: Sequence[ServerConnection],
         observer: DriveObserver,
         live: VehicleCameras | None = None,
+        own: OwnField | None = None,
     ) -> None:
         self._config = config
         self._live = live
+        self._own = own
         self._instants = instant_numbers(config)
         self._servers = tuple(servers)
         self._observer = observer
@@ -146,6 +150,8 @@ class FieldCache:
         return await own.first
 
     async def _holds(self, field_id: str) -> bool:
+        if self._own is not None:
+            return True
         store = FieldStore(self._config.fields.expanduser())
         return field_id in await asyncio.to_thread(store.ids)
 
@@ -210,7 +216,10 @@ class FieldCache:
         archive_ids: Sequence[str],
         beginnings: Beginnings | None = None,
     ) -> RadianceField:
-        """Return the last of ``archive_ids``, fetching those that are not in the store."""
+        """Return the last of ``archive_ids``, fetching those that are not in the store; a user's
+        class is all there is."""
+        if self._own is not None:
+            return self._own
         config = self._config
         folder, render = config.fields.expanduser(), config.render
         store = FieldStore(folder)

@@ -58,7 +58,8 @@ from rfcore.camera import TileOrigin
 from rfcore.dataset.rig import Rig, read_rig
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField
-from rfcore.wire.conventions import RENDERER_CONTRACT
+from rfcore.field.own import OwnField, own_field
+from rfcore.named_class import is_named_class
 from rfcore.wire.instruments import Family, MetricsEndpoint
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract
 from rfcore.wire.notices import StreetNotice
@@ -117,6 +118,7 @@ class Vehicle:
         self._metrics = AgentMetrics(self.registry)
         self._stopped = asyncio.Event()
         self._live: LiveCameras | None = None
+        self._own_field: OwnField | None = None
 
     def stop(self) -> None:
         """Finish the frame in flight, then end."""
@@ -136,6 +138,8 @@ class Vehicle:
         """Open what the drive needs; ``stack`` closes it."""
         config, changed = self._config, asyncio.Event()
         rig = None if config.rig is None else _read_rig(config)
+        if config.field is not None and is_named_class(config.field):
+            self._own_field = await asyncio.to_thread(own_field, config.field)
         recorded = None
         if config.live.source is None and not (rig and rig.is_live):
             recorded = await asyncio.to_thread(
@@ -155,7 +159,7 @@ class Vehicle:
             cameras = self._live = await self._open_live(stack, rig, observer, changed)
         else:
             cameras = recorded
-        fields = FieldCache(config, self._servers, observer, self._live)
+        fields = FieldCache(config, self._servers, observer, self._live, self._own_field)
         stack.push_async_callback(fields.close)
         feed = await self._open_feed(stack, observer)
         searcher = stack.enter_context(
@@ -273,8 +277,9 @@ class Vehicle:
 
     async def _tiles(self, server: ServerConnection) -> tuple[Tile, ...]:
         config = self._config
-        if config.field is not None:
-            return (Tile(WHOLE_STREET, config.field),)
+        field_id = config.field if self._own_field is None else self._own_field.field_id
+        if field_id is not None:
+            return (Tile(WHOLE_STREET, field_id),)
         return await server.published_tiles(config.limits.give_up_s or None)
 
 
@@ -407,13 +412,12 @@ class StreamFactory:
             )
             for camera in prepared.pictures.cameras
         )
-        contract = RendererContract(RENDERER_CONTRACT, exact=True)
         fields = prepared.field_ids
         return Hello(
             config.vehicle,
             cameras,
             fields,
-            contract,
+            RendererContract.of(prepared.field),
             config.allow_recording,
             self._take_notices,
         )

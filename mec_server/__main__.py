@@ -10,13 +10,14 @@ import tyro
 from mec_server.config import ServerConfig
 from mec_server.server import serve
 from rfcore.errors import RfedgeError
-from rfcore.wire.settings import OPTIONS, configure_logs
+from rfcore.wire.settings import OPTIONS, configure_logs, words_of_command_line
 
 
 def main() -> None:
     """Parse the command line and serve until SIGTERM or SIGINT; exit 2 on a user's mistake."""
     try:
-        config = tyro.cli(ServerConfig, config=OPTIONS, prog="mec-server")
+        words = words_of_command_line(sys.argv[1:])
+        config = tyro.cli(ServerConfig, config=OPTIONS, prog="mec-server", args=words)
         configure_logs(sys.stderr, config.log)
         config.render.check()
         asyncio.run(serve(config))

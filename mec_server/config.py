@@ -12,7 +12,7 @@ from tyro.conf import Suppress, arg
 from rfcore.errors import InvalidInput
 from rfcore.update.run import LearnAs
 from rfcore.wire.nats import NatsServers
-from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
+from rfcore.wire.settings import CONFIG, LogForm, MetricsSettings, RenderSettings, TransportSettings
 from rfcore.wire.values import MAX_RATE_HZ, check_name, check_range
 
 
@@ -244,6 +244,8 @@ class ServerConfig:
     """Directory of field archives (.rff)."""
     listen: str = "127.0.0.1:50051"
     """HOST:PORT to accept vehicles on; port 0 takes a free one."""
+    field: Annotated[tuple[str, ...], arg(metavar="MODULE:CLASS ...")] = ()
+    """Fields that classes of your own render, beside those of --fields (docs/how-to/python.md)."""
     record: RecordSettings = RecordSettings()
     learn: LearnSettings = LearnSettings()
     nats: NatsSettings = NatsSettings()
@@ -259,6 +261,9 @@ class ServerConfig:
     """Decode in a sandbox though the server runs as root; refused otherwise."""
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
+    config: Annotated[Path | None, CONFIG] = None
+    """Take options from this TOML file, too: KEY = VALUE, as record_max_gb = 5. The command line
+    wins."""
     ready_file: Path | None = None
     """File that receives HOST:PORT once vehicles are accepted."""
     render: RenderSettings = RenderSettings()

@@ -59,10 +59,12 @@ from mec_server.twin.service import ConsumerAccess, TwinService
 from mec_server.twin.state import Twin
 from rfcore.errors import RfedgeError
 from rfcore.field import RadianceField
+from rfcore.field.own import OwnField, own_field
 from rfcore.files import write_whole
 from rfcore.wire.address import Address
 from rfcore.wire.conventions import SERVER_OPTIONS
 from rfcore.wire.instruments import Family, MetricsEndpoint
+from rfcore.wire.messages import RendererContract
 from rfcore.wire.values import MAX_FIELDS
 from rfcore.wire.waits import log_wait, waiting
 
@@ -189,7 +191,9 @@ class EdgeServer:
         """Make the index of fields, and what records pictures and learns from them."""
         config = self._config
         self._lister = ThreadPoolExecutor(1, "lister", _give_way)
-        self._index = FieldIndex(config.fields)
+        made = map(own_field, config.field)
+        self._own_fields: Mapping[str, OwnField] = {field.field_id: field for field in made}
+        self._index = FieldIndex(config.fields, self._own_fields)
         load = field_loader(self._index, config.render, opened=self._metrics.field_opened)
         self._shelf = FieldShelf(self._index, load)
         self._published = PublishedFields(config.fields, self._shelf.open)
@@ -277,6 +281,7 @@ class EdgeServer:
         return ServerContext(
             decoding=decoding,
             held_field_ids=self._index.ids,
+            contracts={key: RendererContract.of(own) for key, own in self._own_fields.items()},
             metrics=self._metrics,
             limits=self._config.limits,
             entry=self._entry,

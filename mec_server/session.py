@@ -12,9 +12,10 @@ is answered with a Nack and the session lives on; a broken rule of the protocol 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from types import MappingProxyType
 
 from mec_server.camera_queue import SessionCameras
 from mec_server.config import SessionLimits
@@ -30,9 +31,9 @@ from rfcore.errors import (
     RfedgeError,
     UnknownField,
 )
-from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import FrameRefused
 from rfcore.wire.messages import (
+    OUR_CONTRACT,
     Ack,
     ClientMessage,
     DrainNotice,
@@ -41,6 +42,7 @@ from rfcore.wire.messages import (
     FrameAddress,
     Hello,
     Nack,
+    RendererContract,
     ServerMessage,
     StageTimes,
     Welcome,
@@ -107,6 +109,8 @@ class SessionState(StrEnum):
 class ServerSession:
     """One vehicle's stream; ``held_field_ids`` are the fields that this server has.
 
+    ``contracts``: how the fields of users' classes are rendered, by id.
+
     ``identity``: named by the vehicle's certificate; without one any vehicle name is accepted.
     """
 
@@ -117,6 +121,7 @@ class ServerSession:
         now: float,
         limits: SessionLimits | None = None,
         identity: PeerIdentity | None = None,
+        contracts: Mapping[str, RendererContract] = MappingProxyType({}),
     ) -> None:
         self.session_id = session_id
         self.hello: Hello | None = None
@@ -125,6 +130,7 @@ class ServerSession:
         self._limits = limits or SessionLimits()
         self._held = tuple(held_field_ids)
         self._identity = identity
+        self._contracts = contracts
         self._cameras = SessionCameras(self._limits.window_frames)
         self._opening: OpenJob | None = None
         self._outbox: deque[ServerMessage] = deque()
@@ -193,7 +199,8 @@ class ServerSession:
             self._say(FieldNotice(self._held[:MAX_FIELDS]))
             self._close(_unknown_field(unknown[0], self._held))
             return
-        exact = hello.renderer.exact and hello.renderer.name == RENDERER_CONTRACT
+        here = {self._contracts.get(field_id, OUR_CONTRACT) for field_id in hello.field_ids}
+        exact = hello.renderer.exact and here == {hello.renderer}
         self.state = SessionState.OPENING
         self._opening = OpenJob(hello, exact)
 

@@ -40,7 +40,7 @@ from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeErr
 from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
-from rfcore.wire.messages import Frame, Hello
+from rfcore.wire.messages import Frame, Hello, RendererContract
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.tls import peer_identity
 
@@ -61,6 +61,7 @@ class ServerContext:
 
     decoding: DecodingParts
     held_field_ids: Callable[[], tuple[str, ...]]
+    contracts: Mapping[str, RendererContract]
     metrics: ServerMetrics
     limits: SessionLimits
     entry: EntryControl
@@ -113,6 +114,7 @@ class Stream:
             time.monotonic(),
             server.limits,
             self._identity,
+            server.contracts,
         )
 
     def announce_drain(self) -> None:

@@ -24,6 +24,7 @@ from tyro.conf import arg
 
 from rfcore.errors import InvalidInput
 from rfcore.files import DECODED_BYTES
+from rfcore.named_class import is_named_class
 from rfedge.samples import sample_path
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from rfcore.wire.tls import TlsFiles
 
 FIELD = arg(metavar="FIELD")
-"""The path of an archive, or the name of a field."""
+"""The path of an archive, or the name of a field, or MODULE:CLASS (``rfcore.field.own``)."""
 DATASET = arg(metavar="DATASET")
 """A dataset's folder, or the file that describes it (docs/how-to/data.md)."""
 ADDRESS = arg(metavar="HOST:PORT")
@@ -66,6 +67,11 @@ def field_path(name: Path | str) -> Path:
     )
 
 
+def field_source(name: Path | str) -> Path:
+    """Return the file of a field, or ``MODULE:CLASS`` as it was given; raises as ``field_path``."""
+    return Path(name) if is_named_class(str(name)) else field_path(name)
+
+
 def is_field_file(path: Path) -> bool:
     """Return whether a file begins as a field's archive."""
     from rfcore.field.archive import MAGIC
@@ -77,11 +83,16 @@ def is_field_file(path: Path) -> bool:
 
 
 def open_field(name: Path | str, *, threads: int = 1, isa: str | None = None) -> RadianceField:
-    """Load a field by path or name.
+    """Load a field by path or name, or make the one that a user's class renders.
 
-    Raises ``InvalidInput`` as ``field_path`` does and ``FieldFormatError`` for a damaged file.
+    Raises ``InvalidInput`` as ``field_path`` and ``own_field`` do and ``FieldFormatError`` for a
+    damaged file.
     """
     from rfcore.field import load_field
+    from rfcore.field.own import own_field
+
+    if is_named_class(str(name)):
+        return own_field(str(name))
 
     return load_field(field_path(name), threads=threads, isa=isa, max_bytes=max_field_bytes())
 

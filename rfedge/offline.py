@@ -17,6 +17,7 @@ from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
 from rfcore.codec.sender.rate import FrameCosts
 from rfcore.dataset import Dataset
@@ -25,14 +26,12 @@ from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
-from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 from rfcore.wire.values import MAX_PAYLOAD_BYTES
 
 OFFLINE_VEHICLE = "offline"
 CAMERA_ID = "front"
-RENDERER = RendererContract(RENDERER_CONTRACT, exact=True)
 DEFAULT_CHOICE = FrameChoice()
 Locate = Callable[[PosedPicture, I420], FieldView | None]
 """Finds a picture's pose; returns the field's view there, or None if the camera is lost."""
@@ -185,7 +184,8 @@ def encode_drive(
         pose = None if coded.given.lost else coded.given.view.camera.world_from_cam
         frames.append(Frame(CAMERA_ID, picture.time_ns, pose, b"", coded.encoded.packet))
     camera = CameraDescription(CAMERA_ID, intrinsics, encoder.header)
-    return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
+    hello = Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RendererContract.of(field))
+    return CodedDrive(hello, tuple(frames))
 
 
 def _inputs(
@@ -194,7 +194,10 @@ def _inputs(
     """Read one picture after another and render the field at its pose."""
     intrinsics = dataset.pictures[0].camera.intrinsics
     photometric = () if settings.light is LightChange.OFF else None
+    exact = RendererContract.of(field).exact
     choice = FrameChoice(
+        references=None if exact else RENDER_ONLY,
+        block_means=not exact,
         limit_bytes=MAX_PAYLOAD_BYTES,
         qp_map=settings.qp_map,
         photometric=photometric,
@@ -239,7 +242,8 @@ def decode_drive(
         Arrival(frame.packet, camera.posed(frame).view(field, camera.intrinsics))
         for frame in drive.frames
     )
-    decoder = DeltaDecoder(camera.codec, open_decoder=open_decoder)
+    exact = drive.hello.renderer.exact
+    decoder = DeltaDecoder(camera.codec, exact, open_decoder=open_decoder)
     try:
         pictures = decode_frames(decoder, arrivals)
         for frame, picture in zip(drive.frames, pictures, strict=True):

@@ -21,6 +21,7 @@ import structlog
 from rfcore.errors import RfedgeError, UnknownField
 from rfcore.field import RadianceField
 from rfcore.field.folder import FIELD_ID, SUFFIX, FieldFolder, FolderListing
+from rfcore.field.own import OwnField
 from rfcore.field.store import load_checked
 from rfcore.wire.settings import RenderSettings
 from rfcore.wire.tile_manifest import MANIFEST, Publication, read_publication
@@ -31,14 +32,16 @@ Stamp = tuple[int, int, int] | None
 
 
 class FieldIndex:
-    """The fields of ``directory``, as of the last ``refresh``; it satisfies ``shelf.Store``."""
+    """The fields of ``directory``, as of the last ``refresh``, and ``own``: those of users' classes,
+    by id, which have no file."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, own: Mapping[str, OwnField] | None = None) -> None:
+        self.own = own or {}
         self._directory = directory
         self._folder = FieldFolder(directory)
         self._paths: Mapping[str, Path] = MappingProxyType({})
         self._skipped: Mapping[Path, str] = {}
-        self._ids: tuple[str, ...] = ()
+        self._ids: tuple[str, ...] = tuple(sorted(self.own))
         self._opened: dict[str, Path] = {}
         self._lock = threading.Lock()
 
@@ -61,6 +64,9 @@ class FieldIndex:
         """Return the file of a field; raise ``UnknownField``, which names the fields that are
         here."""
         path = self._paths.get(field_id)
+        if field_id in self.own:
+            name = self.own[field_id].name
+            raise UnknownField(f"field {field_id!r} is code and has no file: run {name} yourself")
         if path is None:
             here = ", ".join(self._ids) or "nothing"
             raise UnknownField(f"field {field_id!r} is not on this server; it holds {here}")
@@ -91,7 +97,7 @@ class FieldIndex:
 
     def _list(self, paths: Mapping[str, Path]) -> None:
         self._paths = paths
-        self._ids = tuple(sorted(paths))
+        self._ids = tuple(sorted({*paths, *self.own}))
 
 
 def field_loader(
@@ -108,6 +114,8 @@ def field_loader(
         return load_checked(path, field_id, max_bytes=render.max_field_bytes)
 
     def load(field_id: str) -> RadianceField:
+        if field_id in index.own:
+            return index.own[field_id]
         path = index.published_path(field_id)
         field = load_checked(
             path,

@@ -12,9 +12,11 @@ from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
 from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import RejectReason
-from rfcore.field import FULL, Quality, Renderer, render_field_view
+from rfcore.field import FULL, Quality, RadianceField, Renderer, render_field_view
+from rfcore.field.own import OwnField
 from rfcore.localise.estimate import LocalisationState
 from rfcore.views import FieldView
+from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.values import ClockKind
 
@@ -34,6 +36,17 @@ class RendererContract:
 
     name: str
     exact: bool
+
+    @staticmethod
+    def of(field: RadianceField) -> RendererContract:
+        """Return how this program, or the user's class, renders ``field``."""
+        if isinstance(field, OwnField):
+            return RendererContract(field.name, field.exact)
+        return OUR_CONTRACT
+
+
+OUR_CONTRACT = RendererContract(RENDERER_CONTRACT, exact=True)
+"""Every archive is rendered by this one."""
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,11 @@ happened, and ``reason`` is a word that can be counted.
 from __future__ import annotations
 
 import logging
+import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -28,6 +31,37 @@ from rfcore.wire.tls import TlsFiles
 # are in logs, and flags without a --no- twin.
 OPTIONS = (OmitArgPrefixes, EnumChoicesFromValues, FlagCreatePairsOff)
 PORT_MAX = 65535
+CONFIG_FILE = "--config"
+CONFIG = arg(metavar="FILE.toml")
+
+
+def words_of_command_line(words: Sequence[str]) -> list[str]:
+    """Return a service's command line with the options of its ``--config FILE.toml`` in front.
+
+    A key of the file is an option without its dashes, ``_`` or ``-`` between words; true sets a
+    flag, a list gives several values. Options of the command line come later, and win. Raises
+    ``InvalidInput`` naming the file, and the key that is no option's value.
+    """
+    after = dict(pairwise(words)).get(CONFIG_FILE, "")
+    name = after or next(
+        (w.partition("=")[2] for w in words if w.startswith(f"{CONFIG_FILE}=")), ""
+    )
+    if not name:
+        return list(words)
+    try:
+        options = tomllib.loads(Path(name).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InvalidInput("config", f"{name} cannot be read: {error}") from error
+    words_of_file = []
+    for key, value in options.items():
+        values = value if isinstance(value, list) else [value]
+        if not values or any(isinstance(each, dict | list) for each in values):
+            problem = f"{value!r} is no value of an option; tables and empty lists are none"
+            raise InvalidInput("config", f"{name}: {key}: {problem}")
+        if value is not False:
+            words_of_file.append(f"--{key.replace('_', '-')}")
+            words_of_file += [] if value is True else [str(each) for each in values]
+    return [*words_of_file, *words]
 
 
 @dataclass(frozen=True)

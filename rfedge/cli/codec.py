@@ -26,7 +26,7 @@ class Encode:
     drive: Annotated[Path, Positional, DATASET]
     """Posed pictures in time order, a dataset of any format (docs/how-to/data.md)."""
     field: Annotated[Path, FIELD]
-    """The field: an archive (.rff), or a name."""
+    """The field: an archive (.rff), a name, or MODULE:CLASS (docs/how-to/python.md)."""
     out: Annotated[Path, RFV]
     """The coded drive to write."""
     coding: OmitArgPrefixes[CoderSettings] = CoderSettings()
@@ -83,7 +83,7 @@ class Decode:
     coded: Annotated[Path, Positional, RFV]
     """The coded drive."""
     field: Annotated[Path, FIELD]
-    """The field: an archive (.rff), or a name."""
+    """The field: an archive (.rff), a name, or MODULE:CLASS (docs/how-to/python.md)."""
     out: Annotated[Path, FOLDER]
     """Folder for the PNG files."""
     decoder: Literal["auto", "bubblewrap", "landlock", "child", "in-process"] = "auto"

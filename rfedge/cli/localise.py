@@ -28,7 +28,7 @@ class Localise:
     drive: Annotated[Path, Positional, DATASET]
     """Posed pictures, a dataset of any format (docs/how-to/data.md)."""
     field: Annotated[Path, FIELD]
-    """The field: an archive (.rff), or a name."""
+    """The field: an archive (.rff), a name, or MODULE:CLASS (docs/how-to/python.md)."""
     start_error: Annotated[str, arg(metavar="METRESm:DEGREESdeg")] = "2m:3deg"
     """Distance and angle from the dataset's pose at which each search starts."""
     tries: int | None = None

@@ -16,7 +16,7 @@ class Render:
     """Render a field along a path, as PNG files or one MP4."""
 
     field: Annotated[Path, Positional, FIELD]
-    """The field: an archive (.rff), or a name."""
+    """The field: an archive (.rff), a name, or MODULE:CLASS (docs/how-to/python.md)."""
     out: Annotated[Path, arg(metavar="FOLDER|FILE.mp4")]
     """Folder for the PNG files, or a file ending in .mp4."""
     path: Literal["orbit", "drive"] | None = None

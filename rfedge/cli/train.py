@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -36,6 +37,14 @@ HALVED_UNTIL = 0.25
 """Share of a run limited by time that trains on halved pictures (docs/how-to/training.md)."""
 
 
+PRESETS: Mapping[str, Mapping[str, object]] = {
+    "phone-video": {"undistort": True, "minutes": 5.0},
+    "street": {"minutes": 12.0, "limit": 400_000, "antialiased": True, "sh_degree": 1},
+    "object": {"minutes": 5.0, "limit": 150_000},
+}
+"""Options that suit kinds of pictures (docs/how-to/training.md has the measurements)."""
+
+
 @dataclass(frozen=True)
 class Train:
     """Train a radiance field from posed pictures.
@@ -53,6 +62,9 @@ class Train:
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
     """Train tiles in parallel on the Ray cluster at this address; local starts one here. Each tile
     takes --threads cores. The fields have the same bytes. Needs the extra ray."""
+    preset: Literal["phone-video", "street", "object"] | None = None
+    """Set the options that suit a phone's video, a street's map, or views around an object; what is
+    given besides stays."""
     held_out: Annotated[Path | None, DATASET] = None
     """Another dataset of the same place, for measuring only."""
     holdout: Annotated[int | None, arg(metavar="N")] = None
@@ -124,6 +136,9 @@ class Train:
         from rfcore.errors import InvalidInput
         from rfedge.datasets.convert import read_tiles
 
+        if self.preset is not None:
+            self._with_preset().run()
+            return
         tiles = read_tiles(self.dataset)
         if tiles is not None:
             self._train_tiles(tiles)
@@ -131,6 +146,24 @@ class Train:
         if self.ray is not None:
             raise InvalidInput("ray", f"trains tiles, and {self.dataset} has no tiles.json")
         self.train_one(Console(stderr=self.json == "-"))
+
+    def _with_preset(self) -> Train:
+        """Return these options with those of the preset where they are left at their defaults."""
+        assert self.preset is not None
+        default = {each.name: each.default for each in fields(self)}
+        preset = dict(PRESETS[self.preset])
+        if self.iterations is not None:
+            preset.pop("minutes")
+        chosen = {k: v for k, v in preset.items() if getattr(self, k) == default[k]}
+        words = [
+            f"--{k.replace('_', '-')}" + (f" {v:g}" if v is not True else "")
+            for k, v in chosen.items()
+        ]
+        print(
+            f"preset {self.preset}: {' '.join(words) or 'every option of it is given'}",
+            file=sys.stderr,
+        )
+        return replace(self, preset=None, **chosen)
 
     def train_one(self, console: Console) -> None:
         """Train the field of one dataset, and write it."""

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField, load_field
+from rfcore.field import RadianceField
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
+from rfedge.arguments import open_field
 
 PEAK = 255.0
 STEADY = slice(1, None)
@@ -150,7 +151,7 @@ def _noise_sigma(text: str) -> float:
 @dataclass(frozen=True)
 class DriveOfField:
     """A drive and the field that it is rendered with:
-    ``NAME@HZ=DATASET[,FIELD.rff][,noise=SIGMA]``."""
+    ``NAME@HZ=DATASET[,FIELD][,noise=SIGMA]``; ``FIELD`` is an archive (.rff) or MODULE:CLASS."""
 
     name: DriveName
     field: Path
@@ -158,14 +159,14 @@ class DriveOfField:
     @staticmethod
     def parse(text: str, field: Path) -> DriveOfField:
         """Take ``field`` where the text names none; raises as ``DriveName.parse``."""
-        found = re.fullmatch(r"(.+),([^,]+\.rff)(,noise=[^,]*)?", text)
+        found = re.fullmatch(r"(.+),([^,]+\.rff|[\w.]+:\w+)(,noise=[^,]*)?", text)
         if not found:
             return DriveOfField(DriveName.parse(text), field)
         return DriveOfField(DriveName.parse(found[1] + (found[3] or "")), Path(found[2]))
 
     def read(self, limit: int | None) -> tuple[Drive, RadianceField]:
         """Read the frames and the field."""
-        return read_drive(self.name, limit), load_field(self.field)
+        return read_drive(self.name, limit), open_field(self.field)
 
 
 @dataclass(frozen=True)

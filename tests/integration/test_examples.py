@@ -44,8 +44,21 @@ def write_trajectory(drive: Path, out: Path) -> list[Pose]:
 
 def test_every_example_is_listed() -> None:
     page = (EXAMPLES / "README.md").read_text()
-    names = {path.name for path in EXAMPLES.glob("*.py")}
+    names = {path.name for path in EXAMPLES.iterdir() if path.suffix in (".py", ".ipynb")}
     assert all(f"`{name}`" in page for name in names)
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_from_top_to_bottom(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    names: dict[str, Any] = {}
+    for cell in json.loads((EXAMPLES / "first_hour.ipynb").read_text())["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert names["rate"] == sorted(names["rate"], reverse=True)
+    assert names["quality"] == sorted(names["quality"], reverse=True)
+    assert names["quality"][0] > 30
 
 
 async def test_the_twin_consumer_sees_a_drive(serve: Any, vehicle: Any) -> None:

@@ -41,6 +41,20 @@ def verb(wall: Path, out: Path, **changes: object) -> Train:
     return Train(dataset=wall, out=out, **{**settings, **changes})
 
 
+def test_a_preset_sets_what_is_not_given_and_says_so(wall, tmp_path, capsys):
+    given = dict(sh_degree=2, iterations=20, gaussians=50, limit=60, out=tmp_path / "a.rff")
+    preset, plain = (
+        Train(dataset=wall, plain=True, **given, **more)
+        for more in ({"preset": "street"}, {"antialiased": True})
+    )
+    preset.run()
+    assert "--antialiased" in (said := capsys.readouterr().err)
+    assert not any(word in said for word in ("--sh-degree", "--limit", "--minutes"))
+    written = preset.out.read_bytes()
+    plain.run()
+    assert plain.out.read_bytes() == written
+
+
 def test_it_writes_a_field_a_result_and_a_page(wall, tmp_path):
     out, result, page = (tmp_path / name for name in ("a.rff", "a.json", "a.html"))
     verb(wall, out, json=str(result), report=page, limit=400).run()

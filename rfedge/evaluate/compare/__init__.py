@@ -77,13 +77,13 @@ class EvalCompare(Experiment):
         from rich.console import Console
 
         from rfcore.extras import require
-        from rfedge.arguments import field_path
+        from rfedge.arguments import field_source
         from rfedge.evaluate.compare.run import run_compare
 
         if self.ray is not None:
             require("ray", "ray")
         console = Console()
-        result = run_compare(replace(self, field=field_path(self.field)), console)
+        result = run_compare(replace(self, field=field_source(self.field)), console)
         if self.figures is not None:
             from rfedge.evaluate.compare.figures import write_compare_figures
 

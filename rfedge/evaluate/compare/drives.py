@@ -5,22 +5,22 @@ Drives are read and rendered, and users' codecs loaded, before anything is coded
 
 from __future__ import annotations
 
-import importlib
-import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from types import ModuleType
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.codec.references import RENDER_ONLY, References
 from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField, load_field
+from rfcore.field import RadianceField
+from rfcore.field.own import OwnField
+from rfcore.named_class import make_named
 from rfcore.train.trainer import mean_psnr_db
+from rfedge.arguments import open_field
 from rfedge.evaluate.clips import (
     DECIMATION,
     Clip,
@@ -108,52 +108,13 @@ def _with_intra_refresh(preset: str) -> Rival:
 
 
 def foreign_coder(text: str) -> ClipCoder:
-    """Return an instance of ``package.module:Class``, from the working folder or an installed
-    package; raise ``InvalidInput`` saying what was looked for if there is none."""
-    module_name, colon, class_name = text.partition(":")
-    if not (module_name and colon and class_name):
-        raise InvalidInput("method", f"{text!r} is not MODULE:CLASS, as mjpeg_rival:MotionJpeg")
-    module = _imported(text, module_name)
-    made = getattr(module, class_name, None)
-    if made is None:
-        where = getattr(module, "__file__", None) or "which is built in"
-        raise InvalidInput("method", f"{text!r}: {module_name} ({where}) has no {class_name!r}")
-    try:
-        coder: ClipCoder = made()
-    except (TypeError, ValueError, AttributeError) as error:
-        raise InvalidInput(
-            "method", f"{text!r} cannot be called without arguments: {error}"
-        ) from error
+    """Return an instance of ``package.module:Class``; raise ``InvalidInput`` as ``make_named``
+    does, or for one that lacks a member."""
+    coder = make_named("method", text)
     missing = [key for key in ("name", "points", "version", "code") if not hasattr(coder, key)]
     if missing:
         raise InvalidInput("method", f"{text!r} lacks {', '.join(missing)} of a ClipCoder")
-    return coder
-
-
-def _imported(text: str, module_name: str) -> ModuleType:
-    try:
-        with _working_folder_on_path():
-            return importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and f"{module_name}.".startswith(f"{error.name}."):
-            file = f"{module_name.replace('.', '/')}.py"
-            why = f"there is neither {Path.cwd() / file} nor an installed module {module_name!r}"
-            raise InvalidInput("method", f"{text!r}: {why}") from error
-        raise InvalidInput("method", f"{text!r}: {module_name} needs {error.name!r}") from error
-    except (ImportError, ValueError, TypeError) as error:
-        raise InvalidInput("method", f"{text!r} cannot be imported: {error}") from error
-
-
-@contextmanager
-def _working_folder_on_path() -> Iterator[None]:
-    """Let modules of the working folder be found, as ``python -m`` does, and no longer."""
-    folder = str(Path.cwd())
-    sys.path.insert(0, folder)
-    importlib.invalidate_caches()
-    try:
-        yield
-    finally:
-        sys.path.remove(folder)
+    return cast(ClipCoder, coder)
 
 
 QUICK_FRAMES = 8
@@ -207,7 +168,8 @@ def jobs_of_drives(job: EvalCompare) -> list[EvalCompare]:
 class DriveComparison:
     """One drive with every coder of it, ours (``methods``) with what the field shows.
 
-    ``field`` is the field's archive. ``foregrounds`` has a bool [H, W] for each frame, true where
+    ``field`` is the field's archive, or a user's class, and ``field_bytes`` its size.
+    ``foregrounds`` has a bool [H, W] for each frame, true where
     it differs from the empty street that the drive of digest ``background`` shows; without one
     nothing differs.
     """
@@ -215,17 +177,13 @@ class DriveComparison:
     clip: Clip
     rendered: RenderedClip
     field: Path
+    field_bytes: int
     foregrounds: Sequence[NDArray[np.bool_]]
     background: str | None
     methods: Sequence[FieldCoder]
     families: Mapping[str, Sequence[ClipCoder]]
     for_ssim: Mapping[str, Sequence[ClipCoder]]
     foreground_only: ForegroundCoder | None
-
-    @property
-    def field_bytes(self) -> int:
-        """Size of the field's archive."""
-        return self.field.stat().st_size
 
     @property
     def compared(self) -> list[ClipCoder]:
@@ -254,15 +212,15 @@ def read_drive_comparisons(job: EvalCompare) -> list[DriveComparison]:
     unknown = behind.keys() - {_name(drive.name) for drive in drives}
     if unknown:
         raise InvalidInput("background", f"there is no drive {sorted(unknown)} to stand behind")
-    open_field = cache(load_field)
+    opened = cache(open_field)
     comparisons = []
     for given in slow:
         drive = read_drive(given.name).every(DECIMATION)
-        comparisons.append(_drive_comparison(job, given, drive, None, open_field(given.field)))
+        comparisons.append(_drive_comparison(job, given, drive, None, opened(given.field)))
     for given in drives:
         drive, name = read_drive(given.name, limit), behind.get(_name(given.name))
         background = None if name is None else read_drive(name, limit)
-        field = open_field(given.field)
+        field = opened(given.field)
         comparisons.append(_drive_comparison(job, given, drive, background, field))
     return comparisons
 
@@ -303,10 +261,13 @@ def _drive_comparison(
         rival_stamp = f"{stamp}, field {rendered.field_id}"
         rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
     by_ssim = {} if job.rivals else ssim_rivals(quick=job.quick)
+    is_code = isinstance(field, OwnField)
+    field_bytes = field.size_bytes if is_code else given.field.stat().st_size
     return DriveComparison(
         clip,
         rendered,
         given.field,
+        field_bytes,
         foregrounds,
         behind,
         coders,

@@ -45,8 +45,8 @@ class EvalLadder(Experiment):
         """Measure what is not there yet, write the rows, print the front."""
         from rich.console import Console
 
-        from rfedge.arguments import field_path
+        from rfedge.arguments import field_source
         from rfedge.evaluate.ladder.run import run_ladder
 
-        job = replace(self, fields=tuple(field_path(name) for name in self.fields))
+        job = replace(self, fields=tuple(field_source(name) for name in self.fields))
         run_ladder(job, Console())

@@ -21,9 +21,10 @@ from rich.console import Console
 
 from rfcore.codec.sender.ladder import Rung, TrackingEffort, quality_name
 from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField, load_field
+from rfcore.field import RadianceField
 from rfcore.field.interface import NGP, SPLATS
 from rfcore.field.quality import DETAILS, Quality
+from rfedge.arguments import open_field
 from rfedge.evaluate.clips import Drive, DriveName, read_drive
 from rfedge.evaluate.ladder import LEAST_FRAMES, EvalLadder
 from rfedge.evaluate.ladder.measure import TimedRenders, measure_rung, time_renders, track_drive
@@ -221,7 +222,7 @@ def run_ladder(job: EvalLadder, console: Console) -> dict[str, Any]:
     drive = read_drive(name, QUICK_FRAMES if job.quick else job.frames)
     run = Run.begin("ladder", job, job.fields, console)
     contenders = [
-        Contender(load_field(path), drive, program_version(), job.quick) for path in job.fields
+        Contender(open_field(path), drive, program_version(), job.quick) for path in job.fields
     ]
     _say_cost(contenders, run)
     curves = [

@@ -47,7 +47,7 @@ class EvalNeverWorse(Experiment):
         """Run what is not there yet, write the rows and print them."""
         from rich.console import Console
 
-        from rfedge.arguments import field_path
+        from rfedge.arguments import field_source
         from rfedge.evaluate.never_worse.measure import run_never_worse
 
-        run_never_worse(replace(self, field=field_path(self.field)), Console())
+        run_never_worse(replace(self, field=field_source(self.field)), Console())

@@ -16,9 +16,10 @@ import numpy as np
 from rich.console import Console
 
 from rfcore.camera import Camera, Pose
-from rfcore.field import RadianceField, load_field
+from rfcore.field import RadianceField
 from rfcore.image import I420
 from rfcore.views import FieldView
+from rfedge.arguments import open_field
 from rfedge.evaluate.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, RenderedClip, render_clip
 from rfedge.evaluate.never_worse import EvalNeverWorse
@@ -187,7 +188,7 @@ def run_never_worse(job: EvalNeverWorse, console: Console) -> dict[str, Any]:
     """
     for text in (*job.drives, *job.decimated):
         DriveName.parse(text)
-    run, field = Run.begin("never-worse", job, [job.field], console), load_field(job.field)
+    run, field = Run.begin("never-worse", job, [job.field], console), open_field(job.field)
     drives = [
         NeverWorse(drive, controls_of(field, drive), job.effort, job.preset, program_version())
         for drive in _drives(job)
