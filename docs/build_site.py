@@ -6,9 +6,12 @@ make ``build/site`` of them. A dead link is an error. ``--pages`` stops before z
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import dataclasses
 import functools
 import importlib
+import inspect
 import io
 import os
 import re
@@ -17,7 +20,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import tyro
@@ -30,6 +35,7 @@ from lab.pages.metrics import families
 from mec_server.config import ServerConfig
 from rfcore.wire.instruments import Family
 from rfcore.wire.settings import OPTIONS
+from rfedge.report.tables import SHOWN
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs"
@@ -85,6 +91,37 @@ FILES: Mapping[str, str] = {
     "Links: `rfedge link --profile`": "rfcore.link.plan",
     "Access to a server: `mec-server --access`": "mec_server.access",
 }
+ROWS: Mapping[str, str] = {
+    "compare rows": "rfedge.evaluate.compare.rows:CompareRow",
+    "compare ssim": "rfedge.evaluate.compare.rows:SsimRow",
+    "compare break_even": "rfedge.evaluate.compare.rows:BreakEvenRow",
+    "compare bits": "rfedge.evaluate.compare.rows:BitShareRow",
+    "compare foreground": "rfedge.evaluate.compare.rows:ForegroundRow",
+    "compare curves": "rfedge.evaluate.compare.rows:CurveRow",
+    "never-worse rows": "rfedge.evaluate.never_worse.measure:NeverWorseRow",
+    "ladder rows": "rfedge.evaluate.ladder.rows:LadderRow",
+    "ladder tracking": "rfedge.evaluate.ladder.rows:TrackingRow",
+    "loadtest rows": "lab.pages.loads:RecordedLoad",
+    "paper tables": "lab.paper.report:PaperTable",
+    "benchmark rows": "lab.benchmark.definition:BenchmarkRow",
+    "adapt rows": "lab.adapt.measure:AdaptRow",
+    "robust crossings": "lab.robust.report:CrossingRow",
+    "robust rows": "lab.robust.report:LossRow",
+    "robust disturbances": "lab.robust.report:DisturbanceRow",
+    "latency needed": "lab.latency.report:NeededRow",
+    "latency rows": "lab.latency.report:PlayedRow",
+    "latency shown": "lab.latency.report:ShownRow",
+    "live ages": "lab.live.report:AgeRow",
+    "live ingest": "lab.live.report:IngestRow",
+    "live sources": "lab.live.report:SourceRow",
+    "rig sessions": "lab.rig.report:SessionRow",
+    "rig rows": "lab.rig.report:CameraRow",
+    "faults rows": "lab.pages.suites:FaultRow",
+    "attacks rows": "lab.pages.suites:AttackRow",
+    "stability cases": "lab.pages.suites:StabilityRow",
+    "world rows": "lab.servers.cases:WorldRow",
+}
+"""The rows that result files have: kind and key of a list, and what its rows are read as."""
 VARIABLES = {
     "RFEDGE_TWIN_TOKEN": "The token of `rfedge twin --http`, which no list of processes shows.",
     "RFEDGE_MAX_FIELD_GB": "Memory that the splats of a field may take, in 10^9 bytes.",
@@ -233,6 +270,52 @@ def protocol_page() -> str:
     return "\n".join(parts)
 
 
+def row_type(name: str) -> type[Any]:
+    """Return the dataclass that ``ROWS`` names."""
+    module, _, row = name.partition(":")
+    found: type[Any] = getattr(importlib.import_module(module), row)
+    return found
+
+
+def results_page() -> str:
+    """Return the page of result files: the columns of every list of rows."""
+    parts = [
+        GENERATED + "# Result files\n",
+        "A result is one JSON object: `kind`, `command`, `revision`, `dirty`, `host` and `inputs` "
+        "say how it was made (`rfedge.results`), the rest is the measurement, in lists of rows. A "
+        "column that is not known is left out of its row. Units are in the names; `scene` is the "
+        "drive, `hz` its frames a second, `method` what coded it, `point` its CRF. "
+        "`rfedge.results.rows_of(type, result[key])` reads them back.\n",
+    ]
+    for place, name in ROWS.items():
+        kind, key = place.split()
+        row, columns = row_type(name), list(_columns(row_type(name)))
+        text = re.sub(r"``([^`]+)``", r"`\1`", inspect.cleandoc(row.__doc__ or ""))
+        parts += [
+            f"## {kind}: `{key}`\n\n{text}\n",
+            table(("column", "type", "what it is"), iter(columns)),
+        ]
+        parts.append(f"Read as `{name.replace(':', '.')}`.\n")
+    return "\n".join(parts)
+
+
+def _columns(row: type[Any]) -> Iterator[Sequence[str]]:
+    """Yield each column of a row with what its docstring, or its heading in tables, says."""
+    texts = {}
+    for made in reversed(row.__mro__[:-1]):
+        (body,) = ast.parse(inspect.cleandoc(inspect.getsource(made))).body
+        assert isinstance(body, ast.ClassDef)
+        for line, after in pairwise(body.body):
+            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
+                documented = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                texts[line.target.id] = str(after.value.value) if documented else ""
+    for each in dataclasses.fields(row):
+        heading = each.metadata.get(SHOWN, ("",))[0]
+        text = texts.get(each.name) or heading
+        kind = str(each.type).replace("Sequence", "list").replace("Mapping", "object")
+        yield code(each.name), code(kind), escaped(re.sub(r"\s+", " ", text.replace("``", "")))
+
+
 def api_page() -> str:
     """Return the page of the Python API; mkdocstrings fills it in."""
     parts = [GENERATED + "# Python API\n"]
@@ -274,7 +357,15 @@ def option_names(program: str) -> set[str]:
 def reference_names() -> list[str]:
     """Return the names of the generated pages under ``reference``."""
     programs = [f"commands/{name}.md" for name in PROGRAMS]
-    return [*programs, "configuration.md", "protocol.md", "files.md", "metrics.md", "python.md"]
+    return [
+        *programs,
+        "configuration.md",
+        "protocol.md",
+        "files.md",
+        "results.md",
+        "metrics.md",
+        "python.md",
+    ]
 
 
 def reference() -> dict[str, str]:
@@ -284,6 +375,7 @@ def reference() -> dict[str, str]:
         "configuration.md": configuration_page(),
         "protocol.md": protocol_page(),
         "files.md": docstrings_page("File formats", "Files that rfedge writes.", FORMATS),
+        "results.md": results_page(),
         "metrics.md": metrics_page(),
         "python.md": api_page(),
     }

@@ -32,8 +32,8 @@ Stamp = tuple[int, int, int] | None
 
 
 class FieldIndex:
-    """The fields of ``directory``, as of the last ``refresh``, and ``own``: those of users' classes,
-    by id, which have no file."""
+    """The fields of ``directory``, as of the last ``refresh``, and ``own``: fields of users'
+    classes, by id, which have no file."""
 
     def __init__(self, directory: Path, own: Mapping[str, OwnField] | None = None) -> None:
         self.own = own or {}

@@ -10,6 +10,7 @@ import pytest
 import rfedge.cli
 from docs.pages import DOCS, PROGRAMS, ROOT, Page, commands
 from lab.pages.metrics import families
+from rfedge.results import read_result, rows_of
 from scripts import loaded
 
 build_site = loaded("docs/build_site.py")
@@ -128,6 +129,16 @@ def test_every_metric_and_message_is_in_the_reference():
         for family in declared:
             assert f"`{family.name}`" in build_site.metrics_page()
     assert "message Hello {" in build_site.protocol_page()
+
+
+@pytest.mark.parametrize("place", build_site.ROWS)
+def test_a_list_of_rows_in_recorded_results_is_read_as_the_reference_says(place):
+    kind, key = place.split()
+    results = [read_result(path) for path in build_site.RESULTS.glob("*.json")]
+    found = [result[key] for result in results if result["kind"] == kind and result.get(key)]
+    assert found
+    for rows in found:
+        assert rows_of(build_site.row_type(build_site.ROWS[place]), rows)
 
 
 def test_the_site_has_every_page_of_its_contents(tmp_path):

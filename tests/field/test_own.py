@@ -21,7 +21,7 @@ class Wall:
     def __init__(self, **changes):
         self.changes = changes
 
-    def render(self, camera, quality):
+    def render(self, camera, _quality):
         size = camera.intrinsics.height_px, camera.intrinsics.width_px
         ones = np.ones(size, np.float32)
         grey = np.full((*size, 3), 0.5, np.float32)
@@ -32,7 +32,8 @@ class Wall:
 def test_a_class_with_an_id_and_render_is_a_field():
     field = OwnField(Wall(), "walls.Wall")
     view = field.render(CAMERA)
-    assert view.colour.shape == (12, 20, 3) and (view.depth == 3).all()
+    assert view.colour.shape == (12, 20, 3)
+    assert (view.depth == 3).all()
     assert np.array_equal(field.render_colour(CAMERA, FULL), view.colour)
     assert (field.field_id, field.exact, field.size_bytes) == (ID, False, 0)
     assert field.with_threads(4) is field
@@ -65,7 +66,7 @@ def test_an_id_that_is_no_digest_is_refused(field_id):
 def test_a_class_without_the_members_is_refused_by_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rooms_here.py").write_text("class Empty:\n    pass\n")
-    with pytest.raises(InvalidInput, match="rooms_here.Empty lacks field_id, render"):
+    with pytest.raises(InvalidInput, match=r"rooms_here\.Empty lacks field_id, render"):
         own_field("rooms_here:Empty")
     with pytest.raises(InvalidInput, match="no 'Full'"):
         own_field("rooms_here:Full")

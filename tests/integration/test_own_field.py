@@ -58,7 +58,7 @@ def classes(street, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("named", "exact"), [("Darker", True), ("Rounding", False)])
 async def test_vehicle_and_server_render_by_the_class(
-    classes, named, exact, street, serve, travel, tmp_path
+    classes, named, exact, serve, travel, tmp_path
 ):
     spec = f"{classes}:{named}"
     async with serve(field=(spec,)) as server:

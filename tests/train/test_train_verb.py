@@ -42,7 +42,8 @@ def verb(wall: Path, out: Path, **changes: object) -> Train:
 
 
 def test_a_preset_sets_what_is_not_given_and_says_so(wall, tmp_path, capsys):
-    given = dict(sh_degree=2, iterations=20, gaussians=50, limit=60, out=tmp_path / "a.rff")
+    given = {"sh_degree": 2, "iterations": 20, "gaussians": 50, "limit": 60}
+    given["out"] = tmp_path / "a.rff"
     preset, plain = (
         Train(dataset=wall, plain=True, **given, **more)
         for more in ({"preset": "street"}, {"antialiased": True})
