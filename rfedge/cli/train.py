@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -37,7 +37,7 @@ HALVED_UNTIL = 0.25
 """Share of a run limited by time that trains on halved pictures (docs/how-to/training.md)."""
 
 
-PRESETS: Mapping[str, Mapping[str, object]] = {
+PRESETS: Mapping[str, Mapping[str, Any]] = {
     "phone-video": {"undistort": True, "minutes": 5.0},
     "street": {"minutes": 12.0, "limit": 400_000, "antialiased": True, "sh_degree": 1},
     "object": {"minutes": 5.0, "limit": 150_000},

@@ -261,8 +261,7 @@ def _drive_comparison(
         rival_stamp = f"{stamp}, field {rendered.field_id}"
         rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
     by_ssim = {} if job.rivals else ssim_rivals(quick=job.quick)
-    is_code = isinstance(field, OwnField)
-    field_bytes = field.size_bytes if is_code else given.field.stat().st_size
+    field_bytes = field.size_bytes if isinstance(field, OwnField) else given.field.stat().st_size
     return DriveComparison(
         clip,
         rendered,
