@@ -16,7 +16,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .DELETE_ON_ERROR:
 .SECONDARY:
 .PHONY: results results-full
-results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse robust ladder latency compare compare-small)
+results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse lossy-link robust ladder latency compare compare-small)
 	cp $^ lab/results/
 results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live world paper)
 	cp $(filter %.json,$^) lab/results/
@@ -160,6 +160,10 @@ $(OUT)/classes.json: $(call drive,people) | $(OUT)
 	$(LAB) classes $(SAMPLE) people@10=$< --cells $(OUT)/classes --out $@
 $(OUT)/never-worse.json: | $(OUT)
 	$(RFEDGE) eval never-worse $(SAMPLE) $(NOON) --decimated $(NOON) --cells $(OUT)/never-worse --out $@
+$(OUT)/lossy-link.json: | $(OUT)
+	$(RFEDGE) eval lossy-link --cells $(OUT)/lossy-link --out $@
+$(OUT)/tcp.json: | $(OUT)  # as root: network namespaces
+	$(LAB) tcp --out $@
 # Ten pictures a second do not tell apart round trips that are shorter than 100 ms.
 $(OUT)/robust.json: $(call drive,dusk) $(call drive,lane-0.6) | $(OUT)
 	$(LAB) robust --dusk dusk@10=$< --lane lane-0.6@10=$(word 2,$^) --rtts-ms 50 250 --seeds 20 --processes $(shell nproc) \

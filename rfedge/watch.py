@@ -233,7 +233,8 @@ def watch(settings: WatchSettings, source: PictureSource) -> None:
 
 
 def _say(text: str) -> None:
-    print(f"rfedge watch: {text}", file=sys.stderr, flush=True)
+    sys.stderr.write(f"rfedge watch: {text}\n")
+    sys.stderr.flush()
 
 
 def _say_connected(may_see: str) -> None:

@@ -36,10 +36,10 @@ README_BEGINS, README_ENDS = "<!-- headline: generated -->", "<!-- headline: end
 KINDS: Mapping[str, Report] = {
     report.kind: report
     for report in (
-        *REPORTS[:3],
+        *REPORTS[:4],
         *(PAPER, BENCHMARK, CLASSES, ADAPT, LATENCY, ROBUST, TCP, LOCALISE, SIZING),
         *(LOADS, RATIO, RIG, LIVE, WORLD, SCALE, FAULTS, ATTACKS, STABILITY, SOAK),
-        *REPORTS[3:],
+        *REPORTS[4:],
     )
 }
 """Every kind of result with how it is shown, in the order of the index."""

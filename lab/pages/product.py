@@ -21,6 +21,7 @@ from rfedge.evaluate.compare.rows import (
     of_first_window,
     without_field,
 )
+from rfedge.evaluate.lossy_link.measure import lossy_link_parts
 from rfedge.evaluate.never_worse.measure import NeverWorseRow, never_worse_parts
 from rfedge.report.tables import Column, Table, named_columns, text_table
 from rfedge.results import Result, rows_of
@@ -253,6 +254,12 @@ REPORTS = (
         "2 % more is allowed.",
         never_worse_parts,
         bars("bytes without the header above those of x264, %", _excess),
+    ),
+    Report(
+        "lossy-link",
+        "Lossy links",
+        "What a thin link that loses packets does to a drive over TCP: age, frozen share, quality.",
+        lossy_link_parts,
     ),
     Report(
         "ladder",

@@ -21,7 +21,8 @@ class EvalRobust(Experiment):
     """Send a drive over a lossy link, with noisy poses, and in another light.
 
     Loss comes in bursts on a datagram link with a virtual clock; every method is compared at one
-    total rate, by the SSIM of what a viewer sees. Stopped and started again, it goes on.
+    total rate, by the SSIM of what a viewer sees. Stopped and started again, it goes on. The
+    product sends over TCP: for that, with the link's rate, see `rfedge eval lossy-link`.
     """
 
     field: Annotated[Path, Positional] = sample_path("fields/street.rff")

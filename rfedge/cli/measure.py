@@ -11,6 +11,7 @@ from tyro.conf import arg, subcommand
 from rfedge.arguments import DATASET, FIELD, FOLDER, RENDERER, field_path
 from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.ladder import EvalLadder
+from rfedge.evaluate.lossy_link import EvalLossyLink
 from rfedge.evaluate.never_worse import EvalNeverWorse
 from rfedge.samples import sample_path
 
@@ -109,7 +110,8 @@ class Eval:
     verb: Annotated[
         Annotated[EvalCompare, subcommand("compare")]
         | Annotated[EvalNeverWorse, subcommand("never-worse")]
-        | Annotated[EvalLadder, subcommand("ladder")],
+        | Annotated[EvalLadder, subcommand("ladder")]
+        | Annotated[EvalLossyLink, subcommand("lossy-link")],
         arg(name=""),
     ]
 

@@ -1,4 +1,5 @@
-"""Experiments that people run on their own data: compare, never-worse and ladder.
+"""Experiments that people run on their own data: compare, never-worse,
+lossy-link and ladder.
 
 Each is a package with its command, its measuring and its rows. What they share are the modules
 here: drives and clips of them (``clips``), our codec and its rivals as coders of a clip
