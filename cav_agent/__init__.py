@@ -6,7 +6,8 @@ Other packages use these modules only:
 * ``pipeline``: coding of a picture as an agent does it, for load tests;
 * ``pose_feed``: poses of a feed as an agent reads them;
 * ``field_fetch``: a field fetched from a server;
-* ``session``, ``capture_schedule`` and ``frames``: a vehicle simulated on another clock.
+* ``session``, ``rate_control``, ``capture_schedule`` and ``frames``: a vehicle simulated on another
+  clock.
 
 The others may change without notice.
 """

@@ -19,17 +19,14 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from cav_agent.camera_poses import CameraLocation, DatasetPoses, KnownPoses
 from cav_agent.config import AgentLimits
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob
-from cav_agent.pipeline import Pipeline, PipelineOptions
+from cav_agent.pipeline import Pipeline
 from cav_agent.rate_control import RateControl
 from cav_agent.session import AgentSession, LinkState
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.sender.ladder import Rung
 from rfcore.field import RadianceField, load_field
-from rfcore.image import I420
 from rfcore.link.lossy import LossyLink, PacketLoss
 from rfcore.link.plan import DirectionPlan, LinkPlan
 from rfcore.link.shaper import Connection, LinkProfile
@@ -162,19 +159,6 @@ def _plan(job: EvalLossyLink, loss_percent: float, rate_mbps: float) -> LinkPlan
     return LinkPlan(up, down).with_loss(PacketLoss(loss_percent, job.loss_burst))
 
 
-class KeptViews(KnownPoses):
-    """The drive's own poses, each rendered once."""
-
-    def __init__(self, rendered: RenderedClip) -> None:
-        super().__init__(DatasetPoses())
-        self._rendered = rendered
-
-    def locate(self, capture: Capture, frame: I420, rung: Rung) -> CameraLocation:
-        """Return the place of a picture and what the field shows there."""
-        located = super().locate(capture, frame, rung)
-        return replace(located, view=self._rendered.views[capture.index])
-
-
 class LossyDrive:
     """A vehicle, a server that answers after a while, and a link between them."""
 
@@ -192,9 +176,8 @@ class LossyDrive:
         self._up: LossyLink[Any] = plan.uplink.lossy_link(plan.downlink)
         self._down: LossyLink[Any] = plan.downlink.lossy_link(plan.uplink)
         k = drive.cameras[0].intrinsics
-        options = PipelineOptions(poses=KeptViews(rendered))
         config = CodecConfig(k.width_px, k.height_px)
-        self._pipeline = Pipeline(renderer, config, lambda: 0, options)
+        self._pipeline = Pipeline(renderer, config, lambda: 0)
         camera = CameraDescription(CAMERA, k, self._pipeline.header, drive.name.rate_hz)
         contract = RendererContract(RENDERER_CONTRACT, exact=True)
         hello = Hello("cav-1", (camera,), ("0" * 64,), contract)
