@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,6 +15,7 @@ from rfedge.sizing.estimate import Assumptions
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table as RichTable
 
     from rfedge.sizing.estimate import Demand, Sizing
     from rfedge.sizing.tables import SizingTables
@@ -26,6 +29,8 @@ class Size:
     your own drive and field.
     """
 
+    vehicles: int = 1
+    """Vehicles; of more than one, totals are printed, too."""
     cameras: int = 1
     """Cameras of a vehicle; they take their pictures at the same instant."""
     size: Annotated[str, SIZE] = "1920x1080"
@@ -48,23 +53,37 @@ class Size:
     """Folder of finished measurements, from which a stopped run goes on."""
     assumptions: Annotated[Assumptions, OmitArgPrefixes] = Assumptions()
     json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
-    """Write one JSON object to this file; `-` is standard output."""
+    """Also write one JSON object to this file; `-` is standard output, in place of the tables."""
+    plot: Annotated[Path | None, arg(metavar="FILE.svg|png|pdf")] = None
+    """Draw the rates and links of all vehicles for a report."""
 
     def run(self) -> None:
-        """Estimate and print, or write JSON."""
+        """Estimate, print, and write what is asked for."""
         from rich.console import Console
 
+        from rfcore.errors import InvalidInput
         from rfedge.results import make_result, provenance, write_result
         from rfedge.sizing.estimate import Demand, estimate
 
         width_px, height_px = parse_size(self.size)
         demand = Demand(
-            self.cameras, width_px, height_px, self.hz, self.db, self.delay_ms, self.share
+            self.cameras,
+            width_px,
+            height_px,
+            self.hz,
+            self.db,
+            self.delay_ms,
+            self.share,
+            self.vehicles,
         )
+        if self.plot is not None and self.plot.suffix not in (".svg", ".png", ".pdf"):
+            raise InvalidInput("plot", f"{self.plot} does not end in .svg, .png or .pdf")
         sizing = estimate(demand, self._tables(demand), self.assumptions)
-        if self.json is None:
+        if self.json != "-":
             print_sizing(Console(), sizing)
-        else:
+        if self.plot is not None:
+            write_sizing_plot(sizing, self.plot)
+        if self.json is not None:
             write_result(self.json, make_result("size", provenance(), {"sizing": sizing}))
 
     def _tables(self, demand: Demand) -> SizingTables:
@@ -86,10 +105,7 @@ def print_sizing(console: Console, sizing: Sizing) -> None:
     from rich.table import Table
 
     demand, assumed = sizing.demand, sizing.assumptions
-    console.print(
-        f"{demand.cameras} x {demand.width_px}x{demand.height_px} px at {demand.hz:g} Hz, "
-        f"{demand.psnr_db:g} dB luma PSNR"
-    )
+    console.print(f"A vehicle with {_cameras(demand)}")
     table = Table(box=box.SIMPLE, pad_edge=False)
     names = ["codec", "Mbit/s", "95 %", "cores", "at server", "a cell", "a km2"]
     if demand.delay_ms is not None:
@@ -110,6 +126,8 @@ def print_sizing(console: Console, sizing: Sizing) -> None:
             cells.insert(3, "-" if row.link_mbps is None else f"{row.link_mbps:.2f}")
         table.add_row(*cells)
     console.print(table)
+    if demand.vehicles > 1:
+        console.print(_fleet_table(sizing))
     console.print(
         "Mbit/s of one vehicle with transport; cores on the vehicle and at the server; vehicles "
         "that a cell and a km2 carry."
@@ -120,6 +138,7 @@ def print_sizing(console: Console, sizing: Sizing) -> None:
             f"within {demand.delay_ms:g} ms."
         )
     console.print(f"Measured on {sizing.measured_on}; steady state, without first frames.")
+    console.print(f"Measured: {sizing.measured_at}; logarithms are interpolated between them.")
     console.print(
         f"Cell: {assumed.bandwidth_mhz:g} MHz x {assumed.uplink_share:g} up x "
         f"{assumed.bits_per_hz:g} bit/s/Hz x {assumed.utilisation:g} = {assumed.cell_mbps:.1f} "
@@ -127,3 +146,90 @@ def print_sizing(console: Console, sizing: Sizing) -> None:
     )
     for note in sizing.beyond:
         console.print(f"[yellow]Note[/]: {note}")
+    for warning in sizing.warnings:
+        console.print(f"[bold red]Warning[/]: {warning}")
+
+
+def _cameras(demand: Demand) -> str:
+    cameras = "1 camera" if demand.cameras == 1 else f"{demand.cameras} cameras"
+    return (
+        f"{cameras} of {demand.width_px}x{demand.height_px} px at {demand.hz:g} Hz, "
+        f"{demand.psnr_db:g} dB luma PSNR"
+    )
+
+
+def _fleet_table(sizing: Sizing) -> RichTable:
+    from rich import box
+    from rich.table import Table
+
+    demand = sizing.demand
+    title = f"All {demand.vehicles} vehicles"
+    table = Table(box=box.SIMPLE, pad_edge=False, title=title, title_justify="left")
+    names = ["codec", "Mbit/s", "95 %", "cores at server", "cells"]
+    if demand.delay_ms is not None:
+        names.insert(3, "links")
+    for number, name in enumerate(names):
+        table.add_column(name, justify="right" if number else "left", no_wrap=True)
+    for row in sizing.fleet:
+        cells = [
+            row.codec,
+            f"{row.mbps:.1f}",
+            f"{row.low_mbps:.3g}..{row.high_mbps:.3g}",
+            f"{row.server_cores:.1f}",
+            "-" if row.cells is None else f"{row.cells}",
+        ]
+        if demand.delay_ms is not None:
+            cells.insert(3, "-" if row.link_mbps is None else f"{row.link_mbps:.1f}")
+        table.add_row(*cells)
+    return table
+
+
+def write_sizing_plot(sizing: Sizing, path: Path) -> None:
+    """Draw the mean rate with its interval, and the link that keeps the delay, of all vehicles with
+    each codec; the title has the conditions."""
+    import matplotlib as mpl
+    from matplotlib import pyplot as plt
+
+    from rfcore.files import write_whole
+    from rfedge.report.charts import BLUE, GREY, INK, STYLE
+
+    demand, fleet = sizing.demand, sizing.fleet
+    vehicles = "1 vehicle" if demand.vehicles == 1 else f"{demand.vehicles} vehicles"
+    conditions = [_cameras(demand), f"measured on {sizing.measured_on}", *sizing.warnings]
+    if demand.delay_ms is not None:
+        conditions[0] += f"; link: {100 * demand.share:g} % within {demand.delay_ms:g} ms"
+    with mpl.rc_context({**STYLE, "axes.grid.axis": "x"}):
+        figure, axes = plt.subplots(figsize=(7.2, 0.6 * len(fleet) + 1.2))
+        places = range(len(fleet))
+        mbps = [row.mbps for row in fleet]
+        reach = [
+            [row.mbps - row.low_mbps for row in fleet],
+            [row.high_mbps - row.mbps for row in fleet],
+        ]
+        axes.barh(places, mbps, 0.5, xerr=reach, color=BLUE, ecolor=INK, label="mean rate, 95 %")
+        linked = [(k, row.link_mbps) for k, row in enumerate(fleet) if row.link_mbps is not None]
+        if linked:
+            axes.barh(
+                [k for k, _ in linked],
+                [link for _, link in linked],
+                0.75,
+                color=GREY,
+                zorder=0.5,
+                label="link",
+            )
+        axes.set_yticks(places, [row.codec for row in fleet])
+        axes.invert_yaxis()
+        axes.set_xlabel("uplink, Mbit/s with transport")
+        axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1), fontsize=9)
+        axes.set_title(
+            "\n".join([f"Uplink of {vehicles}", *map(_wrapped, conditions)]), loc="left", fontsize=9
+        )
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=path.suffix[1:], bbox_inches="tight", dpi=200)
+        plt.close(figure)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, buffer.getvalue())
+
+
+def _wrapped(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, 100))

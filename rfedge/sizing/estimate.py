@@ -24,6 +24,8 @@ from rfedge.sizing.tables import CameraDemand, SizingCell, SizingTables, check_r
 INSTANTS = 400
 """Length of the simulation, in pictures of a camera."""
 PRECISION = 1.005
+FULL = 0.99
+"""Mean rate over a link's from which a link counts as fully used."""
 MOST_BPS = 1e12
 HEXAGON = math.sqrt(3) / 2
 """Area of a site's hexagon over the square of the distance between sites."""
@@ -31,7 +33,8 @@ HEXAGON = math.sqrt(3) / 2
 
 @dataclass(frozen=True)
 class Demand:
-    """A vehicle's cameras, the wanted quality, and optionally the time that a frame may take.
+    """A number of vehicles, the cameras of each, the wanted quality, and optionally the time that a
+    frame may take.
 
     ``psnr_db``: luma PSNR of the mean squared error. ``delay_ms``: from a picture to its
     reconstruction, for a ``share`` of the frames; None: only the mean rate is asked about.
@@ -44,8 +47,11 @@ class Demand:
     psnr_db: float
     delay_ms: float | None = None
     share: float = 0.99
+    vehicles: int = 1
 
     def __post_init__(self) -> None:
+        if not 1 <= self.vehicles <= 1_000_000:
+            raise InvalidInput("vehicles", f"{self.vehicles} is outside 1..1000000")
         if not 1 <= self.cameras <= 1000:
             raise InvalidInput("cameras", f"{self.cameras} is outside 1..1000")
         if min(self.width_px, self.height_px) < 1:
@@ -131,14 +137,50 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class FleetEstimate:
+    """One codec's needs for all vehicles: each has a link of its own, so links add up as rates do.
+
+    ``cells``: how many carry the fleet; None if a cell does not carry one vehicle.
+    """
+
+    codec: str
+    vehicles: int
+    mbps: float
+    low_mbps: float
+    high_mbps: float
+    link_mbps: float | None
+    server_cores: float
+    cells: int | None
+
+    @staticmethod
+    def of(one: Estimate, vehicles: int) -> FleetEstimate:
+        """Return the needs of ``vehicles`` such as ``one``."""
+        return FleetEstimate(
+            one.codec,
+            vehicles,
+            vehicles * one.mbps,
+            vehicles * one.low_mbps,
+            vehicles * one.high_mbps,
+            None if one.link_mbps is None else vehicles * one.link_mbps,
+            vehicles * one.server_cores,
+            -(-vehicles // one.vehicles_per_cell) if one.vehicles_per_cell else None,
+        )
+
+
+@dataclass(frozen=True)
 class Sizing:
-    """The estimates, ours first; ``beyond`` says where they go beyond the measurements."""
+    """The estimates, ours first, of a vehicle and of the fleet; ``beyond`` says where they go
+    beyond the measurements, ``warnings`` where a delay makes them misleading."""
 
     demand: Demand
     assumptions: Assumptions
     measured_on: str
     estimates: Sequence[Estimate]
     beyond: Sequence[str] = field(default=())
+    measured_at: str = ""
+    """Sizes and rates of the tables."""
+    warnings: Sequence[str] = field(default=())
+    fleet: Sequence[FleetEstimate] = field(default=())
 
 
 def estimate(
@@ -152,13 +194,50 @@ def estimate(
     cells = {codec: tables.of(codec) for codec in tables.codecs}
     reach = {codec: check_reach(cells[codec], demand.wanted) for codec in cells}
     left_ms = {codec: _left_ms(demand, cells[codec], assumptions) for codec in cells}
+    made = [_estimate(demand, cells[codec], assumptions, left_ms[codec]) for codec in cells]
     return Sizing(
         demand,
         assumptions,
         tables.measured_on,
-        [_estimate(demand, cells[codec], assumptions, left_ms[codec]) for codec in cells],
+        made,
         [*_notes(reach), *_late(demand, left_ms)],
+        tables.measured_at,
+        [] if demand.delay_ms is None else [*_reversals(demand, made), *_full_links(made)],
+        [FleetEstimate.of(one, demand.vehicles) for one in made],
     )
+
+
+def _reversals(demand: Demand, made: Sequence[Estimate]) -> list[str]:
+    """Return a warning if, within the delay, a rival does with less of a link than ours, which
+    needs fewer bits."""
+    ours, *rivals = made
+    reversed_by = [
+        rival
+        for rival in rivals
+        if ours.mbps < rival.mbps and rival.link_mbps is not None
+        if ours.link_mbps is None or ours.link_mbps > rival.link_mbps
+    ]
+    if not reversed_by:
+        return []
+    links = ", ".join(f"{rival.codec} {rival.link_mbps:.3g}" for rival in reversed_by)
+    own = "no link will do" if ours.link_mbps is None else f"needs {ours.link_mbps:.3g} Mbit/s"
+    return [
+        f"{demand.delay_ms:g} ms reverse the saving: {ours.codec} {own}, against {links} Mbit/s. "
+        "It sends fewer bits, but coding and decoding leave less of the time for the link; allow "
+        "more time, or take the rival"
+    ]
+
+
+def _full_links(made: Sequence[Estimate]) -> list[str]:
+    """Return a warning that names the codecs whose link is no faster than their mean rate."""
+    full = [one.codec for one in made if one.link_mbps and one.mbps >= FULL * one.link_mbps]
+    if not full:
+        return []
+    return [
+        f"the link of {', '.join(full)} equals the mean rate, so it is used to 100 %. Frames of "
+        "other streets vary more than those of the short clips that were measured: plan with a "
+        "faster link"
+    ]
 
 
 def _left_ms(demand: Demand, cells: Sequence[SizingCell], assumptions: Assumptions) -> float | None:

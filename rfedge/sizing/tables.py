@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,6 +85,19 @@ class SizingTables:
         """The codecs of the cells, in the order of ``CODECS``."""
         there = {cell.codec for cell in self.cells}
         return tuple(codec for codec in CODECS if codec in there)
+
+    @property
+    def measured_at(self) -> str:
+        """The sizes and rates of the cells, in words."""
+        rates: dict[tuple[int, int], set[float]] = {}
+        for cell in self.cells:
+            rates.setdefault((cell.width_px, cell.height_px), set()).add(cell.hz)
+        return "; ".join(f"{w}x{h} at {_listed(hz)} Hz" for (w, h), hz in sorted(rates.items()))
+
+
+def _listed(rates_hz: Iterable[float]) -> str:
+    *others, last = (f"{hz:.3g}" for hz in sorted(rates_hz))
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def read_tables(path: Path) -> SizingTables:
@@ -163,11 +176,24 @@ def check_reach(cells: Sequence[SizingCell], wanted: CameraDemand) -> tuple[str,
         _beyond("hz", f"{wanted.hz:g} Hz", wanted.hz, rates, factor),
         _beyond_db(cells, wanted.psnr_db),
     ]
-    here = [cell.hz for cell in _nearest_size(cells, wanted.pixels)]
-    if min(rates) <= wanted.hz <= max(rates) and not _within(wanted.hz, here):
-        ends = " and ".join(f"{hz:.3g}" for hz in sorted({min(here), max(here)})) + " Hz"
-        notes.append(f"{size} was measured at {ends}; the effect of the rate is another size's")
+    if min(rates) <= wanted.hz <= max(rates):
+        notes += _borrowed(cells, wanted)
     return tuple(note for note in notes if note)
+
+
+def _borrowed(cells: Sequence[SizingCell], wanted: CameraDemand) -> Iterator[str]:
+    """Yield a note for each size that the wanted one is interpolated from and that was not measured
+    at its rate: the effect of the rate is then that of the size with the widest range."""
+    below = max((c.pixels for c in cells if c.pixels <= wanted.pixels), default=0)
+    above = min((c.pixels for c in cells if c.pixels >= wanted.pixels), default=0)
+    for pixels in sorted({below, above} - {0}):
+        here = [cell for cell in cells if cell.pixels == pixels]
+        if not _within(wanted.hz, [cell.hz for cell in here]):
+            yield (
+                f"{here[0].width_px}x{here[0].height_px} was measured at "
+                f"{_listed(cell.hz for cell in here)} Hz alone; the effect of {wanted.hz:g} Hz is "
+                "another size's"
+            )
 
 
 def _within(value: float, measured: Sequence[float]) -> bool:
@@ -203,8 +229,3 @@ def _beyond_db(cells: Sequence[SizingCell], psnr_db: float) -> str | None:
             f"{high_db:g} dB that were measured of {cells[0].codec}"
         )  # fmt: skip
     return f"{psnr_db:g} dB is {beyond_db:.1f} dB outside {low_db:g}..{high_db:g} dB"
-
-
-def _nearest_size(cells: Sequence[SizingCell], pixels: int) -> list[SizingCell]:
-    nearest = min(cells, key=lambda cell: abs(math.log(cell.pixels / pixels))).pixels
-    return [cell for cell in cells if cell.pixels == nearest]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,7 +82,8 @@ def test_inside_the_measured_ranges_nothing_is_said() -> None:
         (CameraDemand(2560, 1440, 10.0, 34.0), "1.78 times outside"),
         (CameraDemand(640, 360, 60.0, 34.0), "2.00 times outside"),
         (CameraDemand(640, 360, 10.0, 38.5), "38.5 dB is 0.5 dB outside 30..38 dB"),
-        (CameraDemand(1920, 1080, 30.0, 34.0), "the effect of the rate is another size's"),
+        (CameraDemand(1920, 1080, 30.0, 34.0), "1920x1080 was measured at 10 Hz alone"),
+        (CameraDemand(1280, 720, 30.0, 34.0), "1920x1080 was measured at 10 Hz alone"),
     ],
 )
 def test_what_lies_beyond_is_said(wanted: CameraDemand, said: str) -> None:
@@ -192,6 +194,90 @@ def test_less_delay_needs_more_link() -> None:
     assert slow is not None
     assert fast is not None
     assert fast > 2 * slow
+
+
+def test_a_note_never_says_of_a_size_what_was_not_measured() -> None:
+    measured = {(f"{c.width_px}x{c.height_px}", c.hz) for c in shipped_tables().cells}
+    for size_px in ((1280, 720), (800, 450), (480, 270), (1920, 1080), (2560, 1440)):
+        for note in check_reach(shipped_tables().of("rfedge"), CameraDemand(*size_px, 15.0, 34.0)):
+            for size, rates in re.findall(r"(\d+x\d+) was measured at ([\d., and]+) Hz", note):
+                told = {float(hz) for hz in re.findall(r"[\d.]+", rates)}
+                assert told == {hz for at, hz in measured if at == size}
+
+
+@pytest.mark.parametrize(("vehicles", "delay_ms"), [(1, None), (12, 150.0), (237, 100.0)])
+def test_a_fleet_needs_so_many_times_a_vehicle(vehicles, delay_ms):
+    demand = Demand(4, 1280, 720, 10.0, 34.0, delay_ms, vehicles=vehicles)
+    sizing = estimate(demand, shipped_tables())
+    for one, fleet in zip(sizing.estimates, sizing.fleet, strict=True):
+        assert fleet.codec == one.codec
+        for name in ("mbps", "low_mbps", "high_mbps", "server_cores", "link_mbps"):
+            each, total = getattr(one, name), getattr(fleet, name)
+            assert total == (None if each is None else pytest.approx(vehicles * each))
+        if one.vehicles_per_cell:
+            assert (fleet.cells - 1) * one.vehicles_per_cell < vehicles
+            assert vehicles <= fleet.cells * one.vehicles_per_cell
+        else:
+            assert fleet.cells is None
+
+
+def slower(ms: float) -> SizingTables:
+    """Ours with half of the bits of x264 and ``ms`` of work at the sender; x264 with none."""
+    theirs = tuple(replace(c, codec="x264", sender_ms=0.1, receiver_ms=0.1) for c in PARTLY)
+    halved = [
+        replace(
+            c,
+            bytes_per_frame=[n / 2 for n in c.bytes_per_frame],
+            sender_ms=ms,
+            receiver_ms=0.1,
+        )
+        for c in PARTLY
+    ]
+    return SizingTables((*halved, *theirs), "a power law")
+
+
+@pytest.mark.parametrize(("ms", "is_reversed"), [(1.0, False), (39.0, False), (41.0, True)])
+def test_a_delay_that_reverses_the_saving_is_warned_of_and_no_other(ms, is_reversed):
+    """80 ms are left to x264; with half of the bits, ours needs more of a link below 40 ms."""
+    demand = Demand(1, 640, 360, 10.0, 34.0, delay_ms=100.2)
+    sizing = estimate(demand, slower(ms))
+    ours, theirs = sizing.estimates
+    assert (ours.link_mbps > theirs.link_mbps) == is_reversed
+    assert any("reverse the saving" in warning for warning in sizing.warnings) == is_reversed
+    without_delay = estimate(replace(demand, delay_ms=None), slower(ms))
+    assert without_delay.warnings == []
+
+
+def test_a_codec_that_is_late_on_any_link_has_lost_its_saving():
+    sizing = estimate(Demand(1, 640, 360, 10.0, 34.0, delay_ms=100.0), slower(90.0))
+    assert any("no link will do" in warning for warning in sizing.warnings)
+
+
+@pytest.mark.parametrize(("delay_ms", "is_full"), [(1000.0, True), (60.0, False)])
+def test_a_link_that_equals_the_mean_rate_is_warned_of_and_no_other(delay_ms, is_full):
+    sizing = estimate(Demand(1, 640, 360, 10.0, 34.0, delay_ms=delay_ms), slower(1.0))
+    for one in sizing.estimates:
+        assert (one.link_mbps == pytest.approx(one.mbps, rel=0.01)) == is_full
+    assert any("used to 100 %" in warning for warning in sizing.warnings) == is_full
+
+
+@pytest.mark.parametrize(
+    ("suffix", "magic"), [("svg", b"<?xml"), ("png", b"\x89PNG"), ("pdf", b"%PDF")]
+)
+def test_a_plot_for_a_report_names_its_conditions(tmp_path, suffix, magic, capsys):
+    plot = tmp_path / "new" / f"uplink.{suffix}"
+    asked = "--vehicles 12 --cameras 4 --size 640x360 --hz 10 --delay-ms 150"
+    parse(["size", *asked.split(), "--plot", str(plot), "--json", str(tmp_path / "a.json")]).run()
+    assert plot.read_bytes().startswith(magic)
+    if suffix == "svg":
+        conditions = ("12 vehicles", "4 cameras of 640x360 px at 10 Hz", "150 ms", "Mbit/s")
+        assert all(name in plot.read_text() for name in (*CODECS, *conditions))
+    assert "All 12 vehicles" in capsys.readouterr().out, "a file does not silence the table"
+
+
+def test_a_plot_of_another_kind_is_refused(tmp_path):
+    with pytest.raises(InvalidInput, match=r"plot: .*uplink\.jpg does not end in"):
+        parse(["size", "--plot", str(tmp_path / "uplink.jpg")]).run()
 
 
 def test_every_codec_is_in_every_cell_of_the_tables_that_ship() -> None:
