@@ -29,8 +29,8 @@ class LoadTest:
     """Pictures per second of each camera."""
     cameras: int = 1
     """Cameras of each vehicle."""
-    size: int = 4096
-    """Payload of a frame in transport mode, bytes; other modes send the drive's frames."""
+    payload_bytes: int = 4096
+    """Payload of a frame in transport mode; other modes send the drive's frames."""
     link: Annotated[Path | None, arg(metavar="FILE.toml")] = None
     """Link profile (TOML, see samples/links); each vehicle has its own link. Default: loopback."""
     duration: float = 20.0
@@ -82,7 +82,7 @@ class LoadTest:
             duration_s=self.duration,
             warm_up_s=self.warm_up,
             cameras=self.cameras,
-            size_bytes=self.size,
+            payload_bytes=self.payload_bytes,
             link=self.link,
             kind=Vehicles.LIVE if self.live else Vehicles.PRERECORDED,
             vehicle_ms=self.vehicle_ms,

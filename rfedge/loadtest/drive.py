@@ -27,7 +27,7 @@ from typing import Any
 from rfcore.errors import RfedgeError
 from rfcore.extras import needs
 from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S, FleetSpec
-from rfedge.loadtest.plan import Load, Measured, Resources, VehicleReport, Vehicles
+from rfedge.loadtest.plan import SETTLING_S, Load, Measured, Resources, VehicleReport, Vehicles
 
 with needs("loadtest"):
     import psutil
@@ -77,13 +77,19 @@ class Usage:
         """CPU seconds per second of the first thread."""
         return self._rate([sample.loop_cpu_s for sample in self.samples])
 
+    def after(self, seconds: float) -> Usage:
+        """Return the samples taken at least ``seconds`` after the first."""
+        samples = self.samples
+        return Usage([each for each in samples if each.at_s - samples[0].at_s >= seconds])
+
     @property
-    def growth_mb(self) -> float:
-        """Growth of memory over the whole time, from the means of its two halves."""
+    def growth_mb(self) -> float | None:
+        """Growth of memory over the whole time, from the means of its two halves; None of fewer
+        than two samples."""
         rss_mb = [sample.rss_mb for sample in self.samples]
         half = len(rss_mb) // 2
         if not half:
-            return 0.0
+            return None
         return 2 * (sum(rss_mb[-half:]) - sum(rss_mb[:half])) / half
 
     @property
@@ -197,7 +203,6 @@ class RunMeasurements:
             "vehicles_cores": cores.get("vehicles", 0.0),
             "links_cores": cores.get("links", 0.0),
             "others_cores": self.others_cores,
-            "server_growth_mb": self.usage["server"].growth_mb,
             "generator_lag_ms": self.generator_lag_ms,
         }
 
@@ -220,7 +225,8 @@ def measured(load: Load, run: RunMeasurements, link_busy: float, workers: int) -
         generator_lag_ms=run.generator_lag_ms,
     )
     wanted = len(admitted) if load.admission else load.vehicles
-    return Measured(admitted, wanted, server.growth_mb, server.minutes, resources)
+    settled = server.after(max(0.0, SETTLING_S - load.warm_up_s))
+    return Measured(admitted, wanted, settled.growth_mb, settled.minutes, resources)
 
 
 def links_busy(report: Path, load: Load) -> float:

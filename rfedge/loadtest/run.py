@@ -30,7 +30,7 @@ from rfedge.loadtest.drive import (
     links_busy,
     measured,
 )
-from rfedge.loadtest.plan import Load, Mode, Vehicles, Verdict, judge
+from rfedge.loadtest.plan import SETTLING_S, Load, Mode, Vehicles, Verdict, judge
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
 from rfedge.processes import Service, command_of, service
 from rfedge.report.charts import RENDER, STYLE, new_axes, svg
@@ -102,7 +102,8 @@ class LoadRow:
     vehicles_cores: float
     links_cores: float
     others_cores: float
-    server_growth_mb: float
+    server_growth_mb: float | None
+    """Growth of the server's memory after it has settled; None if the run ended before."""
     generator_lag_ms: float
     """99th percentile of how late the generator's event loop was."""
     renderer: str = CPU
@@ -144,7 +145,7 @@ def run_load(load: Load, bed: TestBed) -> Run:
     busy = links_busy(bed.work / "links.jsonl", load) if load.link is not None else 0.0
     found = measured(load, measurements, busy, _workers(load, bed))
     verdict = judge(found, load.bounds)
-    row = _row(load, drive, measurements, verdict)
+    row = _row(load, drive, measurements, verdict, found.growth_mb)
     latency_ms = [ms for vehicle in found.vehicles for ms in vehicle.latency_ms]
     payload_bytes = [len(frame.packet.payload) for frame in drive.chain]
     return Run(load, verdict, row, latency_ms, payload_bytes, measurements.usage)
@@ -155,8 +156,8 @@ def recorded(load: Load, bed: TestBed) -> Path:
     field = load_field(bed.field)
     if load.mode is not Mode.TRANSPORT:
         return prerecorded_drive(bed.drive, field, bed.cache, bed.effort, bed.crf)
-    folder = bed.cache / f"payload-{load.size_bytes}"
-    payload_drive(field.field_id, load.size_bytes).write(folder)
+    folder = bed.cache / f"payload-{load.payload_bytes}"
+    payload_drive(field.field_id, load.payload_bytes).write(folder)
     return folder
 
 
@@ -199,7 +200,11 @@ def _render(load: Load) -> Sequence[str]:
 
 
 def _row(
-    load: Load, drive: PrerecordedDrive, measurements: RunMeasurements, verdict: Verdict
+    load: Load,
+    drive: PrerecordedDrive,
+    measurements: RunMeasurements,
+    verdict: Verdict,
+    growth_mb: float | None,
 ) -> LoadRow:
     k = drive.intrinsics
     return LoadRow(
@@ -225,6 +230,7 @@ def _row(
         admission=load.admission,
         renderer=load.render.renderer,
         threads=load.render.threads,
+        server_growth_mb=growth_mb,
         **measurements.fields(),
     )
 
@@ -250,6 +256,8 @@ def run_loads(
         verdict = runs[-1].verdict
         outcome = "held" if verdict.held else "not held: " + "; ".join(verdict.broken)
         console.print(f"  {outcome}; limit: {verdict.limited_by}")
+        if runs[-1].row.server_growth_mb is None:
+            console.print(f"  memory is not judged: it settles for {SETTLING_S:g} s first")
         return verdict.held
 
     if find_limit:
@@ -344,7 +352,7 @@ def write_load_result(result: LoadResult, out: Path) -> None:
         what=_what(last.load),
         rows=content["rows"],
         deadline_ms=deadline_ms,
-        latency_svg=latency_chart(latency_ms, deadline_ms),
+        latency_svg=latency_chart(latency_ms, deadline_ms, _conditions(last.load)),
     )
 
 
@@ -370,7 +378,13 @@ def _what(load: Load) -> str:
     )
 
 
-def latency_chart(latency_ms: Mapping[str, Sequence[float]], deadline_ms: float) -> str:
+def _conditions(load: Load) -> str:
+    cameras = "1 camera" if load.cameras == 1 else f"{load.cameras} cameras"
+    link = load.link.stem if load.link else "loopback"
+    return f"{cameras} a vehicle at {load.hz:g} Hz, {load.mode}, {link}"
+
+
+def latency_chart(latency_ms: Mapping[str, Sequence[float]], deadline_ms: float, title: str) -> str:
     """Return the share of acknowledged frames over their latency as SVG, a curve for each run."""
     with mpl.rc_context(STYLE):
         figure, axes = new_axes()
@@ -388,8 +402,10 @@ def latency_chart(latency_ms: Mapping[str, Sequence[float]], deadline_ms: float)
             color=RENDER,
         )
         axes.set(xlabel="ms from due to acknowledged", ylabel="% of frames", xscale="log")
+        axes.set_title(title, loc="left", fontsize=10)
         axes.set_ylim(bottom=0)
-        for set_formatter in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
-            set_formatter(mpl.ticker.FormatStrFormatter("%g"))
+        axes.xaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_minor_locator(mpl.ticker.NullLocator())
+        axes.xaxis.set_major_formatter(mpl.ticker.FormatStrFormatter("%g"))
         axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1), fontsize=9)
         return svg(figure)

@@ -5,7 +5,16 @@ import threading
 import psutil
 import pytest
 
-from rfedge.loadtest.drive import Sample, Usage, sample
+from rfedge.loadtest.drive import RunMeasurements, Sample, Usage, measured, sample
+from rfedge.loadtest.plan import (
+    SETTLING_S,
+    Bounds,
+    Load,
+    Measured,
+    Mode,
+    VehicleReport,
+    judge,
+)
 
 
 def samples_of(rss_mb: list[float]) -> list[Sample]:
@@ -28,6 +37,30 @@ def test_a_steady_climb_is_growth_over_the_whole():
 def test_flat_memory_does_not_grow():
     flat = samples_of([100.0, 101.0] * 60)
     assert Usage(flat).growth_mb == 0.0
+
+
+@pytest.mark.parametrize("warm_up_s", [0.0, 4.0, 10.0, 30.0])
+def test_memory_that_a_server_fills_as_it_settles_does_not_count(warm_up_s):
+    """It takes 80 MB in the first 10 s of pictures, and from then on nothing, or 1 MB a second."""
+    seconds = [warm_up_s + 0.5 * k for k in range(61)]
+    for later_mb in (0.0, 1.0):
+        rss_mb = [8 * min(s, SETTLING_S) + later_mb * max(0.0, s - SETTLING_S) for s in seconds]
+        found = measured_of(rss_mb, warm_up_s)
+        assert found.growth_mb == pytest.approx(later_mb * 60 * found.minutes, abs=1.0)
+        assert 60 * found.minutes == pytest.approx(30 - max(0.0, SETTLING_S - warm_up_s))
+
+
+def test_memory_of_a_run_that_ends_before_it_has_settled_is_not_judged():
+    found = measured_of([10.0 * k for k in range(15)], warm_up_s=2.0)
+    assert found.growth_mb is None
+    assert not any("memory" in problem for problem in judge(found, Bounds()).broken)
+
+
+def measured_of(rss_mb: list[float], warm_up_s: float) -> Measured:
+    load = Load(Mode.FULL, 1, 10.0, duration_s=len(rss_mb) / 2, warm_up_s=warm_up_s)
+    usage = {"server": Usage(samples_of(rss_mb))}
+    run = RunMeasurements([VehicleReport(1, [5.0])], 0.0, usage, 0.1, 10.0)
+    return measured(load, run, 0.0, workers=1)
 
 
 def test_this_process_is_seen_with_its_threads():
