@@ -18,7 +18,7 @@ from lab.pages.__main__ import (
 )
 from lab.pages.suites import FAULTS, RESULTS, FaultRow
 from rfcore.errors import InvalidInput
-from rfedge.report.tables import PAGE_COLUMNS
+from rfedge.report.tables import PAGE_COLUMNS, Table
 from rfedge.results import as_json
 
 
@@ -76,9 +76,20 @@ ROW = FaultRow("it breaks", "a hammer", "back <= 1 s; told so", "2.5 s; yes", pa
 
 def test_a_fault_that_does_not_hold_stands_out_with_each_bound_beside_its_figure():
     score, *_, shown = FAULTS.parts({"rows": as_json([ROW])})
-    assert score == "0 of 1 hold."
+    assert score.startswith("Faults: 0 of 1.")
     assert "it breaks: **does not hold**" in shown
     assert "| back <= 1 s | 2.5 s |\n| told so | yes |" in str(shown)
+
+
+def test_the_score_of_the_loads_is_the_sum_of_their_table(results):
+    (score, *parts) = FAULTS.parts(dict(results["faults"][0][1]))
+    tables = {part.title: part.cells for part in parts if isinstance(part, Table)}
+    faults, loads = tables["Kinds of fault"], tables["Loads"]
+    counted = [line[3] for line in loads if "of" in line[3].split()]
+    held, runs = (sum(int(text.split(" of ")[k]) for text in counted) for k in (0, 1))
+    assert f"{held} of {runs}" in score
+    assert all(line[0] in score for line in loads if "not recorded" in line[3])
+    assert not {line[0] for line in faults} & {line[0] for line in loads}
 
 
 def test_a_bound_without_its_figure_is_refused():
