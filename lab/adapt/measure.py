@@ -34,7 +34,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfcore.image import I420
 from rfcore.native.warp import relight_i420
-from rfedge.evaluate.clips import STEADY, Drive, DriveName, read_drive
+from rfedge.evaluate.clips import QUICK, STEADY, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.performance import Performance, perform
 from rfedge.evaluate.rate_curve import rate_curve
@@ -49,7 +49,6 @@ LEAST_LOSS = 0.1
 """Smallest loss, as a share of the bits in the field's own light, that shares are taken of."""
 FIRST = slice(0, 1)
 POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
-QUICK_FRAMES = 6
 OWN_KEYS = ("field", "noon", "empty")
 OFF, MATRIX, AUTO = "off", "matrix", "auto"
 TOOLS: Mapping[str, tuple[Photometric | None, bool | None]] = {
@@ -284,7 +283,7 @@ class _CaseMeasuring:
                 passes=case.passes.get(variant),
                 identities=case.identities.get(variant),
                 drives_to_break_even=drives_to_break_even(
-                    side_bytes, off_kbit, enough, len(drive.frames)
+                    side_bytes, off_kbit, enough, drive.clip().drive_frames
                 ),
                 messages_differ=messages_differ(plain, done) if path is None else None,
                 noon_messages_differ=(
@@ -298,7 +297,7 @@ class _CaseMeasuring:
             )
 
     def _read(self, name: DriveName) -> Drive:
-        return read_drive(name, QUICK_FRAMES if self.job.quick else None)
+        return read_drive(name, QUICK if self.job.quick else None)
 
     def _tool_ms(self, drive: Drive) -> Mapping[str, float]:
         """Return the processor time a frame of each tool, measured once and kept."""

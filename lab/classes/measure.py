@@ -26,6 +26,7 @@ from rfcore.errors import InvalidInput
 from rfcore.extras import needs
 from rfcore.image import I420
 from rfedge.evaluate.clips import (
+    QUICK,
     STEADY,
     Clip,
     CodedClip,
@@ -64,7 +65,6 @@ OURS = "rfedge"
 EQUAL_BITS, EQUAL_QUALITY = "bits", "quality"
 ROUNDING = 1e-9
 """Share by which an interpolated rate may miss the end of its curve."""
-QUICK_FRAMES = 8
 Groups = Sequence[NDArray[np.uint8]]
 """Indices into ``GROUPS`` uint8 [H, W], one array a frame."""
 F64 = NDArray[np.float64]
@@ -140,6 +140,11 @@ class ClassCoder:
         for groups in self.groups:
             digest.update(groups.tobytes())
         return f"{self.coder.version}; classes {digest.hexdigest()[:16]}"
+
+    def of_run(self, run: slice) -> ClassCoder:
+        """Return the coder of the frames ``run`` alone."""
+        coder = self.coder.of_run(run) if isinstance(self.coder, FieldCoder) else self.coder
+        return ClassCoder(coder, self.groups[run])
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames``, which may be the beginning of those of the groups."""
@@ -290,7 +295,8 @@ class ClassComparison:
 
     def curves(self, store: CellStore, at_db: Sequence[float]) -> list[ClassCurve]:
         """Code what is not there yet, at points that span the qualities and the bits asked for."""
-        pixels = np.array([np.bincount(g.ravel(), minlength=len(GROUPS)) for g in self.groups])
+        groups = [self.groups[k] for k in self.clip.coded]
+        pixels = np.array([np.bincount(g.ravel(), minlength=len(GROUPS)) for g in groups])
         window = min(at_db), max(at_db)
         made: list[ClassCurve] = []
         for name, coder in self.coders.items():
@@ -343,7 +349,7 @@ def run_classes(job: EvalClasses, console: Console) -> dict[str, Any]:
 
 
 def _comparison(job: EvalClasses, given: DriveOfField) -> ClassComparison:
-    drive, field = given.read(QUICK_FRAMES if job.quick else None)
+    drive, field = given.read(QUICK if job.quick else None)
     groups = read_groups(given.name, drive)
     ours = FieldCoder(
         render_clip(field, drive.cameras),

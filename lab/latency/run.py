@@ -37,7 +37,7 @@ from rfcore.field import RadianceField, load_field
 from rfcore.link.plan import DirectionPlan
 from rfcore.link.shaper import LinkProfile
 from rfcore.link.traces import read_mahimahi
-from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
+from rfedge.evaluate.clips import ONE_RUN, Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.ladder.measure import measure_frames, time_renders
 from rfedge.evaluate.rivals import x264_lowdelay
@@ -200,7 +200,7 @@ def _lowest(holds: Callable[[float], bool], low: float, high: float) -> float:
 RATES_MBPS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 CRF_STEP = 0.5
 FIRST_CRF, LOWEST_CRF, HIGHEST_CRF = 27.0, 14.0, 44.0
-QUICK_FRAMES, PLAYED_FRAMES = 6, 3000
+PLAYED_FRAMES = 3000
 CURVE_POINTS = 101
 TIMED = 3
 """Times that a frame's work is measured; the least counts: what else the machine does adds to it.
@@ -271,7 +271,7 @@ def _links(traces: Sequence[Path]) -> Iterator[tuple[str, DirectionPlan]]:
 
 
 def _senders(job: EvalLatency, name: DriveName, field: RadianceField, run: Run) -> Iterator[Sender]:
-    drive = read_drive(name, QUICK_FRAMES if job.quick else None)
+    drive = read_drive(name, ONE_RUN if job.quick else None)
     rendered, clip = render_clip(field, drive.cameras), drive.clip()
     ours = FieldCoder(
         rendered, f"rfedge-{job.effort}", program_version("lab/latency"), effort=job.effort

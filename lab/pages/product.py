@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,7 @@ def headline(compared: Result, harder: Result) -> str:
     lines = []
     for row in fair:
         best = _against(rows, row.scene, rival=BEST_OF_ANY_CPU)
-        low, high = row.ci95
+        low, high = _interval(row)
         lines.append(
             (
                 f"{row.scene}, {row.hz:g} Hz",
@@ -70,6 +70,12 @@ def headline(compared: Result, harder: Result) -> str:
         )
     heads = ("drive", "bits against x264 with our tools (95 %)", "against the best of all rivals")
     return f"{sentence}\n\n{text_table(heads, lines).markdown()}\n\n![bits saved]({README_FIGURE})"
+
+
+def _interval(row: CompareRow) -> Sequence[float]:
+    if row.ci95 is None:
+        raise InvalidInput("result", f"{row.scene} has no interval: a quick run is not recorded")
+    return row.ci95
 
 
 def _against(
@@ -117,7 +123,7 @@ def _summary_line(rows: list[CompareRow], paid: list[BreakEvenRow], scene: str) 
     fair = _against(rows, scene)
     best = _against(rows, scene, rival=BEST_OF_ANY_CPU)
     ablated = _against(rows, scene, method="rfedge-without-field")
-    low, high = fair.ci95
+    low, high = _interval(fair)
     (even,) = [row for row in paid if (row.scene, row.method) == (scene, fair.method)][:1]
     saved_mb = 3.6e-3 * even.saved_bytes_per_pass * fair.hz / even.frames_per_pass
     passes = even.passes_to_break_even

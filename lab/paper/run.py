@@ -46,6 +46,7 @@ from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.views import PosedPicture
 from rfedge.arguments import open_field
+from rfedge.evaluate.clips import Runs
 from rfedge.evaluate.runner import Run, program_version
 from rfedge.evaluate.savings import (
     intra_alone,
@@ -168,7 +169,7 @@ def _decoded(clip: Sequence[bytes], setting: Setting) -> list[I420]:
 CONTROL_PRESET, CONTROL_CRF = "medium", 23.0
 TURNED_ROUND = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 """Half a turn about the camera's vertical axis."""
-QUICK_FRAMES = 2
+QUICK_PICTURES = Runs(2, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +279,9 @@ def views_of(job: EvalPaper) -> list[tuple[str, Rgb]]:
 
 def _shots(job: EvalPaper, fields: Sequence[NamedField]) -> Iterator[Shot]:
     for scene, path in map(named_path, job.drives):
-        pictures = read_dataset(path).pictures[:: job.every]
-        pictures = pictures[: QUICK_FRAMES if job.quick else None]
+        pictures: Sequence[PosedPicture] = read_dataset(path).pictures[:: job.every]
+        if job.quick:
+            pictures = [pictures[k] for k in QUICK_PICTURES.chosen(len(pictures))]
         for picture in pictures:
             frame = DriveFrame(scene, picture)
             for opened in fields:

@@ -41,7 +41,7 @@ from rfcore.image import I420
 from rfcore.localise.estimate import PosePrior
 from rfcore.localise.localiser import Localised, Localiser
 from rfcore.motion import quaternion_from_vector
-from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip, Drive, read_drive
+from rfedge.evaluate.clips import ONE_RUN, Clip, ClipCoder, CodedClip, Drive, Runs, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.performance import perform
 from rfedge.evaluate.rivals import x264_lowdelay
@@ -125,7 +125,6 @@ def kbit_between(points: Iterable[tuple[float, float]], quality_db: float, name:
 LOSSES = (0.0, 0.01, 0.05)
 DELTA_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
 DISTURBED_CRFS, RIVAL_CRFS = (23.0, 28.0, 33.0), (20.0, 25.0, 30.0, 35.0)
-QUICK_FRAMES = 8
 SEED = 5
 """The first of the seeds; without loss there is one."""
 RESAMPLED = 2000
@@ -152,7 +151,7 @@ def run_robust(job: EvalRobust, console: Console) -> dict[str, Any]:
         "frames": {"drive": job.drive, "count": count, "sha256": drive.digest},
         "quality_db": job.quality_db,
         "crossings": crossed,
-        **_at_equal_rate(crossed),
+        **_at_equal_rate(crossed, intervals=not job.quick),
         "disturbances": disturbed,
     }
     return run.finish(content, robust_parts)
@@ -183,8 +182,13 @@ def _bench_of_process(job: EvalRobust) -> Bench:
 
 
 def _bench(job: EvalRobust, store: CellStore, console: Console) -> Bench:
-    drive = read_drive(job.drive, QUICK_FRAMES if job.quick else job.frames)
+    drive = read_drive(job.drive, _limit(job))
     return Bench(job, load_field(job.field), drive, store, console)
+
+
+def _limit(job: EvalRobust) -> int | Runs:
+    """Return the frames to read of a drive; time goes on over all, so a quick run has one run."""
+    return ONE_RUN if job.quick else job.frames
 
 
 @dataclass(frozen=True)
@@ -300,7 +304,7 @@ class Bench:
         if self.job.lane is None:
             why = "no drive with a lane offset was given (--lane NAME@HZ=DATASET)"
             return DisturbanceRow("lane offset", "n/a", why)
-        drive = read_drive(self.job.lane, len(self.drive.frames))
+        drive = read_drive(self.job.lane, _limit(self.job))
         kbit = self._own(drive, "lane", drive.cameras)
         return self._row("lane offset", drive.name.scene, kbit, None, self._rival(drive))
 
@@ -309,7 +313,7 @@ class Bench:
         if self.job.dusk is None:
             why = "no drive in another light was given (--dusk NAME@HZ=DATASET)"
             return [DisturbanceRow("light", "n/a", why)]
-        drive = read_drive(self.job.dusk, len(self.drive.frames))
+        drive = read_drive(self.job.dusk, _limit(self.job))
         rival, rows = self._rival(drive), list[DisturbanceRow]()
         for level, choice in (("uncorrected", ()), ("adapted", None)):
             kbit = self._own(drive, level, drive.cameras, photometric=choice)
@@ -364,7 +368,7 @@ class Bench:
         )
 
 
-def _at_equal_rate(crossed: Sequence[CrossingRow]) -> dict[str, Any]:
+def _at_equal_rate(crossed: Sequence[CrossingRow], *, intervals: bool) -> dict[str, Any]:
     """Return SSIM of every scenario at one rate, near the middle of what all can be interpolated
     at."""
     curves: dict[tuple[str, float, float], dict[int, list[CrossingRow]]] = {}
@@ -381,7 +385,7 @@ def _at_equal_rate(crossed: Sequence[CrossingRow]) -> dict[str, Any]:
     for scenario, seeds in curves.items():
         at_rate = np.array([_at_rate(curve, rate_kbps) for curve in seeds.values()])
         ssim, ssim_p5 = at_rate.mean(axis=0).tolist()
-        interval = _interval(at_rate[:, 0]) if len(seeds) > 1 else None
+        interval = _interval(at_rate[:, 0]) if intervals and len(seeds) > 1 else None
         rows.append(LossRow(*scenario, ssim, ssim_p5, len(seeds), interval))
     return {"equal_rate_kbps": rate_kbps, "rows": rows}
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from time import process_time_ns
@@ -56,6 +57,12 @@ class RenderedClip:
     field_id: str
     render_cpu_ms: float
     quality: Quality = FULL
+
+    def of_run(self, run: slice) -> RenderedClip:
+        """Return the renders of the frames ``run`` alone."""
+        views, covered = self.views[run], self.covered[run]
+        render_cpu_ms = self.render_cpu_ms * len(views) / len(self.views)
+        return replace(self, views=views, covered=covered, render_cpu_ms=render_cpu_ms)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -154,6 +161,12 @@ class FieldCoder:
 
     def _foregrounds_digest(self) -> str:
         return _digest(mask for mask in self._foregrounds) if self._foregrounds else "none"
+
+    def of_run(self, run: slice) -> FieldCoder:
+        """Return the coder of the frames ``run`` alone."""
+        part = copy(self)
+        part._rendered, part._foregrounds = self._rendered.of_run(run), self._foregrounds[run]
+        return part
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``; ``rate_hz`` changes nothing here.

@@ -175,7 +175,7 @@ def _beyond(coder: ClipCoder, inner: float, end: float) -> float | None:
 
 def _timed(clip: Clip, coder: ClipCoder, point: float) -> Rows:
     """Return the least of a few runs over the beginning of the clip: others only add to it."""
-    frames = clip.frames[:TIMED_FRAMES]
+    frames = clip.frames[clip.runs[0]][:TIMED_FRAMES]
     runs = [coder.code(frames, clip.rate_hz, point) for _ in range(TIMED_REPEATS)]
     return [{"cpu_ms_per_frame": min(run.cpu_ms for run in runs) / len(frames)}]
 
@@ -211,7 +211,7 @@ def time_in_turns(
 
 
 def _rounds(clip: Clip, tasks: Mapping[str, tuple[ClipCoder, float]]) -> Rows:
-    frames = clip.frames[:TIMED_FRAMES]
+    frames = clip.frames[clip.runs[0]][:TIMED_FRAMES]
     runs: dict[str, list[CodedClip]] = {name: [] for name in tasks}
     for _ in range(ROUNDS):
         for name, (coder, point) in tasks.items():

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ import numpy as np
 from rich.console import Console
 
 from rfedge.evaluate import Experiment
-from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip
+from rfedge.evaluate.clips import BoundCoder, Clip, ClipCoder, CodedClip
 from rfedge.jobs import Cell, CellKey, CellStore, Job, run_jobs
-from rfedge.report.tables import Parts, print_tables
+from rfedge.report.tables import Parts, Table, print_tables
 from rfedge.results import CHECKOUT, Provenance, make_result, provenance, write_result
 
 PROGRAM = ("rfcore", "rfedge/evaluate", "rfedge/offline.py")
@@ -58,8 +59,13 @@ class Run:
         """Write the result, print the tables among its ``parts``, and return the result."""
         result = make_result(self.kind, self.made, {"quick": self.job.quick, **content})
         write_result(self.job.out, result)
-        print_tables(parts(result), self.console)
+        print_tables(map(self._labelled, parts(result)), self.console)
         return result
+
+    def _labelled(self, part: Table | str) -> Table | str:
+        if not self.job.quick or isinstance(part, str):
+            return part
+        return replace(part, title=f"QUICK, not for figures. {part.title}".rstrip())
 
 
 @cache
@@ -88,7 +94,9 @@ def _program_files(root: Path, also: Sequence[str]) -> Iterator[Path]:
 
 def clip_key(clip: Clip, coder: ClipCoder, point: float) -> CellKey:
     """Return the key of ``clip`` coded by ``coder`` at ``point``."""
+    part = {} if clip.part is None else {"part": str(clip.part)}
     return {
+        **part,
         "scene": clip.scene,
         "hz": clip.rate_hz,
         "frames": clip.frames_digest,
@@ -101,14 +109,40 @@ def clip_key(clip: Clip, coder: ClipCoder, point: float) -> CellKey:
 def coded_clip(clip: Clip, coder: ClipCoder, point: float, store: CellStore) -> CodedClip:
     """Return ``clip`` coded at ``point``, from ``store`` or coded now and then kept.
 
-    Raises ``InvalidData`` naming the file if a stored cell is damaged.
+    Each run of a clip is coded on its own, and of what was coded ``Clip.coded`` is kept, so that
+    all frames but the first are steady, as those of a whole drive. Raises ``InvalidData`` naming
+    the file if a stored cell is damaged.
     """
     cell = store.cell(clip_key(clip, coder, point))
     if cell.path.exists():
         return _clip_of(cell)
-    coded = coder.code(clip.frames, clip.rate_hz, point)
+    if clip.part is None:
+        coded = coder.code(clip.frames, clip.rate_hz, point)
+    else:
+        coded = _joined([_coded_run(clip, coder, point, run) for run in clip.runs])
+        coded = coded.of_frames(clip.coded)
     cell.keep(_fields(coded))
     return coded
+
+
+def _coded_run(clip: Clip, coder: ClipCoder, point: float, run: slice) -> CodedClip:
+    if isinstance(coder, BoundCoder):
+        coder = coder.of_run(run)
+    return coder.code(clip.frames[run], clip.rate_hz, point)
+
+
+def _joined(runs: Sequence[CodedClip]) -> CodedClip:
+    receivers_ms = [run.receiver_cpu_ms for run in runs if run.receiver_cpu_ms is not None]
+    notes = {name: [run.notes[name] for run in runs] for name in runs[0].notes}
+    return CodedClip(
+        runs[0].point,
+        np.concatenate([run.frame_bytes for run in runs]),
+        np.concatenate([run.luma_mse for run in runs]),
+        np.concatenate([run.ssim for run in runs]),
+        sum(run.cpu_ms for run in runs),
+        {name: tuple(chain.from_iterable(values)) for name, values in notes.items()},
+        sum(receivers_ms) if len(receivers_ms) == len(runs) else None,
+    )
 
 
 def _fields(coded: CodedClip) -> dict[str, Any]:

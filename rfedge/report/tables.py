@@ -12,9 +12,9 @@ from a row (``Column``)::
     Table("Bits", columns(Row), rows).print(console)
 
 Columns without any value are left out, and values that are the same in every row go into a line
-below. What is wider than the terminal, or than
-``PAGE_COLUMNS`` on a page, continues in a further table below, which repeats the columns that tell
-its rows apart.
+below. A terminal shows a line for each row: those that tell the rows apart, and as many of the
+other columns, the first before the last, as fit; a line below names the rest. On a page, columns
+beyond ``PAGE_COLUMNS`` continue in a further table, which repeats those that tell its rows apart.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 PAGE_COLUMNS = 8
 """At most so many columns of a page's table fit a screen."""
-BORDER = 3
-"""Characters a column of a terminal's table needs beside its text: two spaces and a line."""
+BORDER = 2
+"""Spaces between the columns of a terminal's table."""
 SHOWN = "shown"
 Cells = Sequence[Sequence[str]]
 
@@ -142,10 +142,13 @@ class Table:
         widths = _widths(self.headings, cells)
         if self.title:
             console.print(self.title, markup=False, highlight=False, style="italic")
-        for part in _parts(varying, cells, widths, console.width - 1):
-            self._print_part(console, part, widths, cells)
-        if same:
-            console.print(f"In every row: {same}.", markup=False, highlight=False)
+        fitting = _parts(varying, cells, widths, console.width + BORDER)[0]
+        self._print_part(console, fitting, widths, cells)
+        left_out = ", ".join(self.headings[k] for k in varying if k not in fitting)
+        for told, what in (("In every row", same), (f"Wider than {console.width}", left_out)):
+            if what:
+                console.print(f"{told}: {what}.", markup=False, highlight=False)
+        console.print()
 
     def markdown(self) -> str:
         """Return the table in Markdown, its first column aligned left and the others right."""
@@ -173,10 +176,13 @@ class Table:
     def _print_part(
         self, console: Console, part: Sequence[int], widths: Sequence[int], cells: Cells
     ) -> None:
+        import rich.box
         import rich.table
         from rich.text import Text
 
-        printed = rich.table.Table()
+        printed = rich.table.Table(
+            box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, BORDER - 1, 0, 0)
+        )
         for k in part:
             header = Text(_broken(self.headings[k], widths[k] - BORDER))
             is_number = all(row[k][:1] in "0123456789+-±." for row in cells)
@@ -221,7 +227,7 @@ def _escaped(text: str) -> str:
 def _widths(headings: Sequence[str], cells: Cells) -> list[int]:
     """Return the characters that each column needs, its heading broken where it can be."""
     parts = [[*_heading_parts(h), *(row[k] for row in cells)] for k, h in enumerate(headings)]
-    return [max(map(len, texts)) + BORDER for texts in parts]
+    return [max(len(text.rstrip()) for text in texts) + BORDER for texts in parts]
 
 
 def _heading_parts(heading: str) -> list[str]:

@@ -2,15 +2,22 @@
 
 import hashlib
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfedge.evaluate.clips import (
+    ONE_RUN,
+    QUICK,
     CodedClip,
+    Drive,
     DriveName,
+    Runs,
     luma_mse,
     luma_sse,
     psnr_of_mse,
@@ -109,3 +116,33 @@ def test_a_noisy_drive_has_the_noise_that_its_name_says_and_always_the_same(thum
 def test_noise_that_is_none_is_refused(noise):
     with pytest.raises(InvalidInput, match=f"noise={noise} is not a number of 0..64"):
         DriveName.parse(f"wall@10=drive.json,noise={noise}")
+
+
+@given(st.integers(1, 500), st.sampled_from((QUICK, ONE_RUN, Runs(2, 1), Runs(3, 5, 2))))
+def test_runs_are_consecutive_and_cover_a_drive_from_end_to_end(length, runs):
+    chosen = runs.chosen(length)
+    assert len(chosen) == min(length, runs.count * runs.frames)
+    assert chosen == sorted(set(chosen))
+    starts = [k for k in chosen if k - 1 not in chosen]
+    assert all(k + runs.frames - 1 in chosen for k in starts) or len(chosen) == length
+    left, right = chosen[0], length - 1 - chosen[-1]
+    if runs.count > 1:
+        gaps = [b - a for a, b in pairwise(chosen) if b - a > 1]
+        assert (left, right) == (0, 0)
+        assert max(gaps, default=0) - min(gaps, default=0) <= 1
+    else:
+        assert abs(right - left) <= 1, "in the middle"
+
+
+def test_of_each_run_the_settling_frames_do_not_count():
+    frames = [A] * 20
+    clip = Drive(DriveName.parse("a@10=x"), frames, frames).spread(Runs(2, 4, 2)).clip()
+    assert clip.runs == [slice(0, 4), slice(4, 8)]
+    assert clip.coded == [0, 2, 3, 6, 7], "the very first stands for the first of the drive"
+    assert clip.drive_frames == 20
+
+
+def test_a_drive_no_longer_than_its_runs_is_whole():
+    frames = [A] * 8
+    drive = Drive(DriveName.parse("a@10=x"), frames, frames)
+    assert drive.spread(Runs(2, 4, 2)).clip() == drive.clip()

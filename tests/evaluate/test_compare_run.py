@@ -1,8 +1,10 @@
 """The verb ``rfedge eval compare``, from files to a result file."""
 
+import io
 import json
 import math
 import pickle
+import re
 import sys
 from dataclasses import replace
 from functools import partial
@@ -18,8 +20,10 @@ from rfedge.evaluate.clips import DriveName, read_drive
 from rfedge.evaluate.compare import EvalCompare, measure
 from rfedge.evaluate.compare.drives import foreign_coder, jobs_of_drives, read_drive_comparisons
 from rfedge.evaluate.compare.measure import BEST, BEST_OF_ANY_CPU
+from rfedge.evaluate.compare.rows import compare_parts
 from rfedge.evaluate.compare.run import run_compare
 from rfedge.jobs import run_jobs
+from rfedge.report.tables import Table
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {
@@ -148,18 +152,38 @@ def test_every_curve_spans_the_window_that_was_asked_for(compared):
     assert {tuple(row["window_db"]) for row in result["rows"]} == {(33.0, 36.0)}
 
 
-def test_every_row_of_a_comparison_has_its_interval_around_its_figure(compared):
+def test_a_quick_comparison_has_no_interval_and_names_each_method_once(compared):
     _, result = compared
     for row in result["rows"]:
         assert set(row) >= ROW_KEYS
+        assert row["ci95"] is None
+    assert {row["method"].rsplit("-", 1)[0] for row in result["rows"]} == {
+        "rfedge-fast",
+        "rfedge-thorough",
+        "rfedge-render-only-fast",
+        "rfedge-without-field-fast",
+    }
+
+
+def test_a_quick_comparison_says_so_in_each_table_and_has_a_line_for_a_rival(compared):
+    job, result = compared
+    console = Console(record=True, file=io.StringIO(), width=80)
+    run_compare(job, console)
+    printed = console.export_text()
+    tables = list(compare_parts(result))
+    assert printed.count("QUICK") == sum(isinstance(part, Table) for part in tables)
+    for setting in {row["rival_setting"] for row in result["rows"]}:
+        lines = re.findall(rf"^{setting} .*$", printed, re.MULTILINE)
+        assert len(lines) == 1
+
+
+def test_a_whole_comparison_has_its_interval_around_its_figure(compared):
+    """From the cells of a quick one: the drive is no longer than its runs."""
+    quick, _ = compared
+    job = replace(quick, quick=False, rivals=("x264-lowdelay",), out=quick.out.with_name("w.json"))
+    for row in run_compare(job, Console(quiet=True))["rows"]:
         low, high = row["ci95"]
         assert low <= row["bd_rate_percent"] <= high
-    assert {row["method"].rsplit("-", 2)[0] for row in result["rows"]} == {
-        "rfedge",
-        "rfedge-thorough",
-        "rfedge-render-only",
-        "rfedge-without-field",
-    }
 
 
 def test_shares_of_area_and_bits_are_whole(compared):

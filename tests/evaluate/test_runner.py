@@ -11,7 +11,7 @@ from rich.console import Console
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.image import I420
 from rfedge.evaluate import Experiment
-from rfedge.evaluate.clips import Clip, CodedClip
+from rfedge.evaluate.clips import Clip, CodedClip, Drive, DriveName, Runs
 from rfedge.evaluate.rivals import x264_lowdelay
 from rfedge.evaluate.runner import Run, coded_clip, program_version
 from rfedge.jobs import CellStore
@@ -36,6 +36,24 @@ class Counting:
         mse, ssim = np.array([1.5, 2.5, 0.1]), np.array([0.9, 0.8, 1.0])
         notes = {"mode": ("render", "warp", "warp")}
         return CodedClip(point, np.array([100, 20, 30]), mse, ssim, 12.25, notes)
+
+
+def test_runs_are_coded_apart_and_their_steady_frames_joined(tmp_path):
+    class Telling:
+        """Bytes of a frame: a hundred times its level, and its number in the clip."""
+
+        name, points, version = "telling", (1.0,), "test"
+
+        def code(self, frames, _rate_hz, point):
+            sizes = np.array([100 * int(f.y[0, 0]) + k for k, f in enumerate(frames)])
+            return CodedClip(point, sizes, np.ones(len(frames)), np.ones(len(frames)), 1.0)
+
+    frames = [I420(np.full((48, 64), k, np.uint8), FRAME.u, FRAME.v) for k in range(9)]
+    drive = Drive(DriveName.parse("a@10=x"), frames, frames)
+    made = coded_clip(drive.spread(Runs(2, 3)).clip(), Telling(), 1.0, CellStore(tmp_path))
+    assert made.frame_bytes.tolist() == [0, 101, 202, 701, 802]
+    whole = coded_clip(drive.clip(), Telling(), 1.0, CellStore(tmp_path))
+    assert whole.frame_bytes.tolist() == [101 * k for k in range(9)]
 
 
 def forbidden():

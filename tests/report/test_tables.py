@@ -4,7 +4,7 @@ import io
 import re
 from collections.abc import Sequence
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
@@ -36,14 +36,20 @@ def test_brackets_are_text_and_not_markup():
 LETTERS = st.text("abcdefgh0123456789.", min_size=1, max_size=12)
 
 
+@settings(max_examples=30)
 @given(
-    st.integers(2, 9).flatmap(
+    st.integers(2, 12).flatmap(
         lambda n: st.lists(st.tuples(*[LETTERS] * n), min_size=2, max_size=6, unique=True)
-    )
+    ),
+    st.sampled_from((WIDTH, 400)),
 )
-def test_rows_that_differ_are_printed_as_different_lines(rows):
+def test_a_row_is_a_line_and_what_does_not_fit_is_named(rows, width):
     columns = [f"column{k}" for k in range(len(rows[0]))]
-    text = printed("", columns, [list(row) for row in rows], width=400)
-    lines = [tuple(re.findall(r"[\w.]+", x)) for x in text.splitlines() if x.startswith("│")]
+    head, rest = printed("", columns, [list(row) for row in rows], width).split("─\n")
+    lines = [tuple(re.findall(r"[\w.]+", line)) for line in rest.splitlines()[: len(rows)]]
     varying = [k for k in range(len(columns)) if len({row[k] for row in rows}) > 1]
-    assert lines == [tuple(row[k] for k in varying) for row in rows]
+    if width == WIDTH:
+        assert len(set(lines)) == len(rows)
+    else:
+        assert lines == [tuple(row[k] for k in varying) for row in rows]
+    assert all(column in head + rest for column in columns)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -99,14 +100,14 @@ class SplitClip:
     crf: float
 
 
-def split_rows(clip: SplitClip) -> list[dict[str, Any]]:
+def split_rows(clips: Sequence[SplitClip]) -> list[dict[str, Any]]:
     """Return the share of the macroblocks and of the slices' bytes, and the bytes a frame, of each
-    kind; the first frame is not counted."""
-    areas, slices = np.zeros(len(KINDS)), np.zeros(len(KINDS))
-    for area, share in _split_frames(clip):
+    kind over the runs of a drive; the first frame of each is not counted."""
+    areas, slices, frames = np.zeros(len(KINDS)), np.zeros(len(KINDS)), 0
+    for area, share in chain.from_iterable(map(_split_frames, clips)):
         areas += area
         slices += share
-    frames = len(clip.frames) - 1
+        frames += 1
     return [
         {
             "shows": kind,

@@ -23,6 +23,7 @@ from rfcore.train.trainer import mean_psnr_db
 from rfedge.arguments import open_field
 from rfedge.evaluate.clips import (
     DECIMATION,
+    QUICK,
     Clip,
     ClipCoder,
     Drive,
@@ -117,9 +118,6 @@ def foreign_coder(text: str) -> ClipCoder:
     return cast(ClipCoder, coder)
 
 
-QUICK_FRAMES = 8
-
-
 @dataclass(frozen=True)
 class Method:
     """Settings of our coder; None leaves references to the encoder, the effort to the job."""
@@ -128,12 +126,12 @@ class Method:
     effort: str | None = None
 
 
-METHODS = {
-    "rfedge": Method(),
-    "rfedge-thorough": Method(effort="thorough"),
-    "rfedge-render-only": Method(RENDER_ONLY),
-    "rfedge-without-field": Method(WITHOUT_FIELD),
-}
+METHODS = (
+    ("rfedge", Method()),
+    ("rfedge", Method(effort="thorough")),
+    ("rfedge-render-only", Method(RENDER_ONLY)),
+    ("rfedge-without-field", Method(WITHOUT_FIELD)),
+)
 """Our coder as it is; with nearly as much time for a slice as x264 medium takes; and without a past
 and without a field, which tells what each is worth."""
 
@@ -203,7 +201,7 @@ def read_drive_comparisons(job: EvalCompare) -> list[DriveComparison]:
 
     Raises ``InvalidInput`` for a background that does not fit its drive, and as ``read_drive``.
     """
-    limit = QUICK_FRAMES if job.quick else None
+    limit = QUICK if job.quick else None
     drives, slow = (
         [DriveOfField.parse(text, job.field) for text in texts]
         for texts in (job.drives, job.decimated)
@@ -216,6 +214,8 @@ def read_drive_comparisons(job: EvalCompare) -> list[DriveComparison]:
     comparisons = []
     for given in slow:
         drive = read_drive(given.name).every(DECIMATION)
+        if job.quick:
+            drive = drive.spread(QUICK)
         comparisons.append(_drive_comparison(job, given, drive, None, opened(given.field)))
     for given in drives:
         drive, name = read_drive(given.name, limit), behind.get(_name(given.name))
@@ -245,17 +245,18 @@ def _drive_comparison(
     stamp = program_version()
     if behind is not None:
         stamp += f", before {behind[:16]}"
-    coders = [
-        FieldCoder(
+    coders = {}
+    for own, method in METHODS:
+        effort = method.effort or job.effort
+        name = f"{own}-{effort}-{rendered.field_id[:12]}"
+        coders[name] = FieldCoder(
             rendered,
-            f"{name}-{method.effort or job.effort}-{rendered.field_id[:12]}",
+            name,
             stamp,
-            effort=method.effort or job.effort,
+            effort=effort,
             references=method.references,
             foregrounds=() if behind is None else foregrounds,
         )
-        for name, method in METHODS.items()
-    ]
     rival = None
     if behind is not None:
         rival_stamp = f"{stamp}, field {rendered.field_id}"
@@ -269,7 +270,7 @@ def _drive_comparison(
         field_bytes,
         foregrounds,
         behind,
-        coders,
+        list(coders.values()),
         families,
         by_ssim,
         rival,

@@ -69,9 +69,15 @@ def write_compare_figures(result: Result, folder: Path) -> list[Path]:
     everybody = rows_of(CurveRow, result["curves"])
     for scene, hz in dict.fromkeys((row.scene, row.hz) for row in everybody):
         curves = [row for row in everybody if (row.scene, row.hz) == (scene, hz)]
-        written += write_figure(folder / f"rd_{scene}_{hz:g}", *_curves(curves))
-        written += write_figure(folder / f"cpu_{scene}_{hz:g}", *_frontier(curves))
+        written += _written(result, folder / f"rd_{scene}_{hz:g}", *_curves(curves))
+        written += _written(result, folder / f"cpu_{scene}_{hz:g}", *_frontier(curves))
     return written
+
+
+def _written(result: Result, stem: Path, figure: Figure, lines: Lines) -> list[Path]:
+    if result["quick"]:
+        figure.suptitle("QUICK, not for figures", x=1, ha="right")
+    return write_figure(stem, figure, lines)
 
 
 def write_bd_rates(result: Result, folder: Path, name: str = "bd_rates") -> list[Path]:
@@ -82,7 +88,7 @@ def write_bd_rates(result: Result, folder: Path, name: str = "bd_rates") -> list
     compared = rows_of(CompareRow, result["rows"])
     if not compared:
         raise InvalidInput("result", "there is no row to draw")
-    return write_figure(folder / name, *_bd_rates(of_first_window(compared)))
+    return _written(result, folder / name, *_bd_rates(of_first_window(compared)))
 
 
 def _curves(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
@@ -185,7 +191,8 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
     """Return what ours saves on each drive, by rival; intervals are of the headline's."""
     lines: Lines = [["scene", "hz", "method", "rival", "setting", "bd_rate_percent", "low", "high"]]
     for row in rows:
-        numbers = [f"{value:.2f}" for value in (row.bd_rate_percent, *row.ci95)]
+        interval = (math.nan, math.nan) if row.ci95 is None else row.ci95
+        numbers = [f"{value:.2f}" for value in (row.bd_rate_percent, *interval)]
         names = [row.method, row.rival, row.rival_setting]
         lines.append([row.scene, f"{row.hz:g}", *names, *numbers])
     ours = of_first_method(rows)
@@ -199,9 +206,9 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
             places = [drives.index((row.scene, row.hz)) for row in those]
             values = [row.bd_rate_percent for row in those]
             axes.plot(values, places, marker, color=colour, markersize=5, label=rival)
-            if rival == HEADLINE_ANCHOR:
-                lows, highs = ([row.ci95[end] for row in those] for end in (0, 1))
-                axes.hlines(places, lows, highs, color=colour)
+            intervals = [row.ci95 for row in those if row.ci95 is not None]
+            if rival == HEADLINE_ANCHOR and intervals:  # all or, of a quick run, none
+                axes.hlines(places, *zip(*intervals, strict=True), color=colour)
         axes.set_yticks(range(len(drives)), [f"{scene}, {hz:g} Hz" for scene, hz in drives])
         axes.tick_params("y", labelsize=8)
         axes.invert_yaxis()

@@ -86,6 +86,10 @@ class ForegroundCoder:
         rival = replace(plain, options={**plain.options, "x264-params": params})
         return ForegroundCoder(f"rfdvc-style-{preset}", masks, renders, rival, stamp)
 
+    def of_run(self, run: slice) -> ForegroundCoder:
+        """Return the coder of the frames ``run`` alone."""
+        return replace(self, masks=self.masks[run], renders=self.renders[run])
+
     @property
     def points(self) -> Sequence[float]:
         """CRFs."""

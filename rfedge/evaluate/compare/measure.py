@@ -51,6 +51,8 @@ def compare_rows(
     method: Performance,
     families: Mapping[str, Sequence[Performance]],
     windows_db: Sequence[Window] = WINDOWS_DB,
+    *,
+    interval: bool = True,
 ) -> list[CompareRow]:
     """Return a row per family of rivals, one against the best of no more processor time at both
     ends, and one against the best of all; windows after the first are for the anchors and the best.
@@ -58,15 +60,18 @@ def compare_rows(
     A family is one codec at several settings; the strongest that takes no more processor time than
     the method stands for it, or its quickest if none is that quick. Windows after the first are
     left out where a curve, or that of resampled frames, does not span them: a good field shows
-    30 dB before a bit is sent. Raises ``InvalidInput`` when a curve does not span the first.
+    30 dB before a bit is sent. Without ``interval``, as for a few frames, figures have none. Raises
+    ``InvalidInput`` when a curve does not span the first.
     """
     headline, *wider = windows_db
-    rows = _window_rows(clip, method, families, headline)
+    rows = _window_rows(clip, method, families, headline, interval=interval)
     everybody = [method, *chain.from_iterable(families.values())]
     for window in wider:
         if all(each.steady.spans(window) for each in everybody):
             with suppress(InvalidInput):  # resampled clips leave the window
-                rows += _window_rows(clip, method, families, window, ANCHORS_AND_BEST)
+                rows += _window_rows(
+                    clip, method, families, window, ANCHORS_AND_BEST, interval=interval
+                )
     return rows
 
 
@@ -76,10 +81,12 @@ def _window_rows(
     families: Mapping[str, Sequence[Performance]],
     window: Window,
     begins: tuple[str, ...] = ("",),
+    *,
+    interval: bool,
 ) -> list[CompareRow]:
     """Return the rows of one window against families whose names begin like one of ``begins``."""
     return [
-        _row(clip, method, name, rival, window)
+        _row(clip, method, name, rival, window, interval=interval)
         for name, rival in _chosen(method, families, window).items()
         if name.startswith(begins)
     ]
@@ -117,10 +124,19 @@ def _comparable(method: Performance, rival: Performance) -> bool:
 
 
 def _row(
-    clip: Clip, method: Performance, family: str, rival: Performance, window: Window
+    clip: Clip,
+    method: Performance,
+    family: str,
+    rival: Performance,
+    window: Window,
+    *,
+    interval: bool,
 ) -> CompareRow:
     ours, theirs = method.steady, rival.steady
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    ci95 = None
+    if interval:
+        rng = np.random.default_rng(BOOTSTRAP_SEED)
+        ci95 = bd_rate_interval(rival.clips, method.clips, window, rng, least_share=0.5)
     return CompareRow(
         scene=clip.scene,
         hz=clip.rate_hz,
@@ -129,7 +145,7 @@ def _row(
         rival_setting=rival.name,
         window_db=window,
         bd_rate_percent=bd_rate_percent(theirs, ours, window),
-        ci95=bd_rate_interval(rival.clips, method.clips, window, rng, least_share=0.5),
+        ci95=ci95,
         points=len(method.clips),
         saving_percent_at_db={
             f"{db:g}": 100 * (1 - ours.bytes_at(db) / theirs.bytes_at(db))
@@ -217,11 +233,11 @@ def break_even_row(
 ) -> BreakEvenRow:
     """Return what the field's own bytes leave of the saving after 1, 10 and 100 passes.
 
-    A pass is the clip once; its first frame is counted with it. Bytes are those at 33 dB, or at the
-    lowest quality above it that both curves have. Negative figures are bytes lost.
+    A pass is the whole drive once; its first frame is counted with it. Bytes are those at 33 dB, or
+    at the lowest quality above it that both curves have. Negative figures are bytes lost.
     """
     at_db = max(BREAK_EVEN_DB, method.steady.psnr_db[0], rival.steady.psnr_db[0])
-    frames = len(clip.frames) - 1
+    frames = clip.drive_frames - 1
     if frames < 1:
         raise InvalidInput("frames", "a pass needs at least 2 frames")
     ours, theirs = (

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeVar
 
 from rfedge.report.tables import Column, Table, columns, shown
@@ -31,16 +32,16 @@ class CompareRow:
     scene: str
     hz: float
     method: str
-    rival: str = field(metadata=shown("rival"))
+    rival: str
     """The family of settings, such as ``x264-lowdelay``."""
-    rival_setting: str = field(metadata=shown("setting"))
+    rival_setting: str
     """The setting that stands for its family."""
     window_db: Sequence[float] = field(metadata=shown("window dB", "{:g}..{:g}"))
     """Lowest and highest luma PSNR."""
     bd_rate_percent: float = field(metadata=shown("BD-rate %", "+.1f"))
     """Negative if the method needs fewer bytes."""
-    ci95: Sequence[float] = field(metadata=shown("95 %", "{:.1f}..{:.1f}"))
-    """Interval of the BD-rate from blocks of frames drawn with replacement."""
+    ci95: Sequence[float] | None = field(metadata=shown("95 %", "{:.1f}..{:.1f}"))
+    """Interval of the BD-rate from blocks of frames drawn with replacement; None of a quick run."""
     points: int
     saving_percent_at_db: Mapping[str, float]
     """Saving by luma PSNR; a quality that a curve does not reach is left out."""
@@ -195,19 +196,21 @@ def _compared_tables(compared: Sequence[CompareRow]) -> Iterator[Table | str]:
     first = of_first_window(compared)
     window = "{:g}..{:g}".format(*compared[0].window_db)
     ours = without_field(compared[0].method)
-    figures = ("rival", "rival_setting", "bd_rate_percent", "ci95")
-    against = columns(CompareRow, *figures, SAVINGS, BOTH_ENDS, SSIM, FIRST_FRAME)
-    for name, rows in _by_drive(of_first_method(first)).items():
-        yield Table(f"{name}: {ours} over {window} dB", against, rows)
-    anchor = _anchor(compared)
     told = ("bd_rate_percent", "ci95")
-    methods = [row for row in first if row.rival == anchor]
+    for name, rows in _by_drive(of_first_method(first)).items():
+        rival = Column("rival", partial(_starred, rows))
+        against = columns(CompareRow, rival, *told, BOTH_ENDS, SAVINGS, SSIM, FIRST_FRAME)
+        once = {row.rival_setting: row for row in rows}
+        yield Table(f"{name}: {ours} over {window} dB. {STARS}", against, list(once.values()))
+    family = _anchor(compared)
+    methods = [row for row in first if row.rival == family]
+    anchor = methods[0].rival_setting
     yield Table(
         f"By method, against {anchor} over {window} dB",
         columns(CompareRow, DRIVE, METHOD, *told, SENDER, BOTH_ENDS, DEVIATION),
         methods,
     )
-    windows = [row for row in of_first_method(compared) if row.rival == anchor]
+    windows = [row for row in of_first_method(compared) if row.rival == family]
     yield Table(
         f"By window of luma PSNR, {ours} against {anchor}",
         columns(CompareRow, DRIVE, "window_db", *told),
@@ -220,15 +223,30 @@ def _compared_tables(compared: Sequence[CompareRow]) -> Iterator[Table | str]:
     )
 
 
+STARS = "*: strongest that takes no more time than ours; **: strongest of all."
+
+
+def _starred(rows: Iterable[CompareRow], shown: CompareRow) -> str:
+    """Return the name of a row's setting, marked if it is the strongest of ``rows``."""
+    setting = shown.rival_setting
+    families = {row.rival for row in rows if row.rival_setting == setting}
+    stars = "**" if BEST_OF_ANY_CPU in families else "*" if BEST in families else ""
+    return f"{setting} {stars}".rstrip()
+
+
 def _anchor(compared: Sequence[CompareRow]) -> str:
-    """Return the headline's rival, or the first of a comparison without it."""
+    """Return the headline's rival, or the first with our tools, or of a comparison without it the
+    first of all."""
     rivals = [row.rival for row in compared]
-    return HEADLINE_ANCHOR if HEADLINE_ANCHOR in rivals else rivals[0]
+    with_our_tools = [rival for rival in rivals if rival.startswith("x264-our-tools")]
+    return HEADLINE_ANCHOR if HEADLINE_ANCHOR in rivals else (with_our_tools or rivals)[0]
 
 
 def without_field(method: str) -> str:
-    """Return a method's name without the digest of its field."""
-    return method.rsplit("-", 1)[0]
+    """Return a method's name without the digest of its field, its effort once."""
+    name = method.rsplit("-", 1)[0]
+    without_effort, _, effort = name.rpartition("-")
+    return without_effort if without_effort.endswith(f"-{effort}") else name
 
 
 def of_first_window(rows: Sequence[CompareRow]) -> list[CompareRow]:

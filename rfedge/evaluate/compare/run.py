@@ -148,13 +148,18 @@ def _tables(job: EvalCompare, comparison: DriveComparison, run: Run) -> dict[str
     if comparison.foreground_only is not None:
         # Its whole picture has a ceiling below any window: it is not asked to span one.
         theirs = performed(comparison.foreground_only, None).clips
-        foreground = [foreground_row(clip, methods[0].clips, theirs, comparison.foregrounds)]
+        masks = [comparison.foregrounds[k] for k in clip.coded]
+        foreground = [foreground_row(clip, methods[0].clips, theirs, masks)]
     return {
         "rows": [
             row
             for method in methods
             for row in compare_rows(
-                clip, method, families, _windows_db(job) if method is methods[0] else [window]
+                clip,
+                method,
+                families,
+                _windows_db(job) if method is methods[0] else [window],
+                interval=not job.quick,
             )
         ],
         "ssim": ssim_rows(clip, methods[0], for_ssim),
@@ -170,7 +175,11 @@ def _bits(
 ) -> list[BitShareRow]:
     clip, middle_db = comparison.clip, sum(_windows_db(job)[0]) / 2
     crf = ours.nearest(middle_db).point
-    split = SplitClip(clip.frames, comparison.rendered, comparison.foregrounds, job.effort, crf)
+    rendered, foregrounds = comparison.rendered, comparison.foregrounds
+    split = [
+        SplitClip(clip.frames[part], rendered.of_run(part), foregrounds[part], job.effort, crf)
+        for part in clip.runs
+    ]
     key = {
         **clip_key(clip, comparison.methods[0], crf),
         "split": 1,
@@ -185,6 +194,7 @@ def _frames(comparison: DriveComparison) -> dict[str, Any]:
     clip = comparison.clip
     return {
         "count": len(clip.frames),
+        **({} if clip.part is None else {"part": clip.part}),
         "sha256": clip.frames_digest,
         "field_id": comparison.rendered.field_id,
         "field_bytes": comparison.field_bytes,

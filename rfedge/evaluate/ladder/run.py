@@ -25,7 +25,7 @@ from rfcore.field import RadianceField
 from rfcore.field.interface import NGP, SPLATS
 from rfcore.field.quality import DETAILS, Quality
 from rfedge.arguments import open_field
-from rfedge.evaluate.clips import Drive, DriveName, read_drive
+from rfedge.evaluate.clips import ONE_RUN, Drive, DriveName, read_drive
 from rfedge.evaluate.ladder import LEAST_FRAMES, EvalLadder
 from rfedge.evaluate.ladder.measure import TimedRenders, measure_rung, time_renders, track_drive
 from rfedge.evaluate.ladder.rows import LadderRow, TrackingRow, front_table
@@ -124,7 +124,6 @@ def _beats(other: RungRow, row: RungRow) -> bool:
     return a[0] <= b[0] and a[1] <= b[1] and a != b
 
 
-QUICK_FRAMES = 4
 PROBE_FRAMES = LEAST_FRAMES
 NOMINAL_RATE_HZ = 10.0
 """Rate that the drive is named with; bits and times of a rung do not depend on it."""
@@ -219,7 +218,7 @@ def run_ladder(job: EvalLadder, console: Console) -> dict[str, Any]:
     Raises ``InvalidInput`` or ``DatasetError`` before anything is measured if an input is wrong.
     """
     name = DriveName(job.drive.stem, NOMINAL_RATE_HZ, job.drive)
-    drive = read_drive(name, QUICK_FRAMES if job.quick else job.frames)
+    drive = read_drive(name, ONE_RUN if job.quick else job.frames)
     run = Run.begin("ladder", job, job.fields, console)
     contenders = [
         Contender(open_field(path), drive, program_version(), job.quick) for path in job.fields

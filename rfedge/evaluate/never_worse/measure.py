@@ -20,7 +20,7 @@ from rfcore.field import RadianceField
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.arguments import open_field
-from rfedge.evaluate.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
+from rfedge.evaluate.clips import DECIMATION, QUICK, Clip, ClipCoder, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, RenderedClip, render_clip
 from rfedge.evaluate.never_worse import EvalNeverWorse
 from rfedge.evaluate.performance import Performance, perform, seconds_left
@@ -32,7 +32,6 @@ from rfedge.results import Result, rows_of
 
 AT_DB = (31.0, 33.0, 35.0)
 ALLOWED_PERCENT = 2.0
-QUICK_FRAMES = 6
 CONTROLS = ("right", "wrong-street", "black")
 POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
 """Wide, since x264 takes a lower quantiser at the same CRF the fewer frames a second there are."""
@@ -202,9 +201,10 @@ def run_never_worse(job: EvalNeverWorse, console: Console) -> dict[str, Any]:
 
 
 def _drives(job: EvalNeverWorse) -> list[Drive]:
-    limit = QUICK_FRAMES if job.quick else None
     slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
-    return [*slow, *(read_drive(text, limit) for text in job.drives)]
+    if job.quick:
+        slow = [drive.spread(QUICK) for drive in slow]
+    return [*slow, *(read_drive(text, QUICK if job.quick else None) for text in job.drives)]
 
 
 DRIVE = Column("drive", lambda row: f"{row.scene}, {row.hz:g} Hz")
