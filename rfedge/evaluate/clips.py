@@ -160,8 +160,8 @@ class RunsOfDrive:
 
 
 QUICK = Runs(4, 8, 4)
-"""What ``--quick`` codes of a drive. On KITTI's loop, -35.5 % as a whole, such runs are 2 points off,
-8 if all frames but the first of each count, and single frames 37."""
+"""What ``--quick`` codes of a drive. On KITTI's loop, -35.5 % as a whole, such runs are 2 points
+off, and 8 if all frames but the first of each count."""
 ONE_RUN = Runs(1, 6)
 """The same where time goes on from frame to frame, as over a link."""
 
