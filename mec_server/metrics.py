@@ -15,8 +15,6 @@ from functools import cached_property, partial
 
 import structlog
 from prometheus_client import CollectorRegistry, Counter, Histogram
-from prometheus_client.core import CounterMetricFamily, Metric
-from prometheus_client.registry import Collector
 
 from mec_server.config import DecoderKind
 from mec_server.decoding.process import LossCause
@@ -27,7 +25,7 @@ from mec_server.tile_history import TileHistory
 from rfcore.codec.references import references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
-from rfcore.wire.instruments import Family, Instruments
+from rfcore.wire.instruments import Instruments, Readings
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
 from rfcore.wire.tiles import Tile
 
@@ -77,25 +75,6 @@ class OpeningResult(StrEnum):
     CANCELLED = "cancelled"
     """The stream was over before its decoders were open."""
 
-
-SPENT_FAMILY = Family(
-    "rfedge_server_spent_total",
-    "counter",
-    "What identities spent: calls, messages, bytes, worker_seconds, rejected_seconds.",
-    ("resource",),
-)
-SUPPRESSED = Family(
-    "rfedge_server_log_lines_suppressed_total",
-    "counter",
-    "Log lines about peers that were not written, since their identity caused too many.",
-)
-
-WITHDRAWALS = Family(
-    "rfedge_server_tile_withdrawals_total",
-    "counter",
-    "Learnt fields of a tile that were withdrawn, since they made somebody's bits more.",
-    ("tile",),
-)
 
 STAGES = tuple(f.name.removesuffix("_ns") for f in fields(StageTimes) if f.name != "total_ns")
 
@@ -185,10 +164,20 @@ class ServerMetrics:
         self._identity_budget = make.gauge(
             "rfedge_server_identity_budget", "What one identity may hold.", ("resource",)
         )
-        self._spent: dict[str, Callable[[], float]] = {}
-        make.collector(SPENT_FAMILY, ReadCounter(SPENT_FAMILY, self._spent))
-        self._suppressed: dict[str, Callable[[], float]] = {}
-        make.collector(SUPPRESSED, ReadCounter(SUPPRESSED, self._suppressed))
+        self._spent: Callable[[], Readings] = dict
+        make.read(
+            "rfedge_server_spent_total",
+            "What identities spent: calls, messages, bytes, worker_seconds, rejected_seconds.",
+            ("resource",),
+            lambda: self._spent(),
+        )
+        self._suppressed: Callable[[], float] = float
+        make.read(
+            "rfedge_server_log_lines_suppressed_total",
+            "Log lines about peers that were not written, since their identity caused too many.",
+            (),
+            lambda: {(): self._suppressed()},
+        )
         self.decoders_lost = make.counter(
             "rfedge_server_decoders_lost",
             "Decoder processes that died in use: by a signal, by themselves, or for being slow.",
@@ -243,8 +232,13 @@ class ServerMetrics:
             "Share of bits that the last learnt field saved on frames held back; 0 if withdrawn.",
             ("tile",),
         )
-        self._withdrawals: dict[str, Callable[[], float]] = {}
-        make.collector(WITHDRAWALS, ReadCounter(WITHDRAWALS, self._withdrawals))
+        self._withdrawals: dict[tuple[str, ...], float] = {}
+        make.read(
+            "rfedge_server_tile_withdrawals_total",
+            "Learnt fields of a tile that were withdrawn, since they made somebody's bits more.",
+            ("tile",),
+            lambda: self._withdrawals,
+        )
         self._fields = make.gauge(
             "rfedge_server_field_info",
             "1 for each open radiance field: the first 16 digits of its id, and its kind.",
@@ -285,8 +279,8 @@ class ServerMetrics:
             self._most_held.labels(resource).set_function(partial(ledger.most_held, resource))
             self._budget.labels(resource).set(ledger.budget(resource).total)
             self._identity_budget.labels(resource).set(ledger.budget(resource).identity)
-        self._spent |= {name: partial(ledger.spent, name) for name in SPENT}
-        self._suppressed[""] = lambda: limiter.suppressed
+        self._spent = lambda: {(name,): ledger.spent(name) for name in SPENT}
+        self._suppressed = lambda: limiter.suppressed
 
     def field_opened(self, field: RadianceField) -> None:
         """Publish which field was opened."""
@@ -310,7 +304,7 @@ class ServerMetrics:
     def show_learnt(self, histories: Mapping[str, TileHistory]) -> None:
         """Publish the histories of learning, by tile."""
         for name, history in histories.items():
-            self._withdrawals[name] = partial(float, history.withdrawals)
+            self._withdrawals[(name,)] = history.withdrawals
             if history.learnt:
                 last = history.learnt[-1]
                 self._learnt.labels(name).set(last.time_ms / 1e3)
@@ -404,24 +398,3 @@ class VehicleMetrics:
     def _latency(self) -> Histogram:
         latency = self._metrics.latency
         return latency.labels(*self._label) if self._label else latency
-
-
-class ReadCounter(Collector):
-    """Counters that are read from elsewhere at each scrape, by the value of their one label."""
-
-    def __init__(self, family: Family, counts: Mapping[str, Callable[[], float]]) -> None:
-        self._family = family
-        self._counts = counts
-
-    def describe(self) -> Iterable[Metric]:
-        return [self._empty()]
-
-    def collect(self) -> Iterable[Metric]:
-        metric = self._empty()
-        for value, count in self._counts.items():
-            metric.add_metric([value] if self._family.labels else [], count())
-        return [metric]
-
-    def _empty(self) -> CounterMetricFamily:
-        family = self._family
-        return CounterMetricFamily(family.name, family.text, labels=list(family.labels))

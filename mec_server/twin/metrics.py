@@ -3,35 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from enum import StrEnum
 
-from prometheus_client.core import GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
-
-from mec_server.metrics import ReadCounter
 from mec_server.twin.state import Twin
-from rfcore.wire.instruments import Family, Instruments
+from rfcore.wire.instruments import Instruments, Readings
 from rfcore.wire.notices import NOTICE_KINDS, ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
-
-AGE = Family(
-    "rfedge_twin_age_seconds",
-    "gauge",
-    "Seconds since the capture of the newest picture there is: of the vehicle where it is oldest.",
-)
-MISSED = Family(
-    "rfedge_twin_pictures_missed_total",
-    "counter",
-    "Pictures that a consumer was too slow for.",
-)
-
-
-NATS_DROPPED = Family(
-    "rfedge_twin_nats_dropped_total",
-    "counter",
-    "Pictures that NATS was too slow, too small or away for.",
-)
 
 
 class ConsumerEnd(StrEnum):
@@ -47,17 +25,27 @@ class ConsumerEnd(StrEnum):
 class TwinMetrics:
     """Ages and misses are read from the twin at the moment of a scrape."""
 
-    def __init__(
-        self,
-        make: Instruments,
-        twin: Twin,
-        *,
-        per_vehicle: bool = False,
-    ) -> None:
-        labels = ("vehicle",) if per_vehicle else ()
-        age = Family(AGE.name, AGE.kind, AGE.text, labels)
-        make.collector(age, _Ages(age, lambda: twin.ages_s(time.monotonic())))
-        make.collector(MISSED, ReadCounter(MISSED, {"": lambda: twin.missed}))
+    def __init__(self, make: Instruments, twin: Twin, *, per_vehicle: bool = False) -> None:
+
+        def ages_s() -> Readings:
+            ages = twin.ages_s(time.monotonic())
+            if per_vehicle:
+                return {(vehicle_id,): age_s for vehicle_id, age_s in ages.items()}
+            return {(): max(ages.values())} if ages else {}
+
+        make.read(
+            "rfedge_twin_age_seconds",
+            "Seconds since the capture of the newest picture there is: of the vehicle where it is "
+            "oldest.",
+            ("vehicle",) if per_vehicle else (),
+            ages_s,
+        )
+        make.read(
+            "rfedge_twin_pictures_missed_total",
+            "Pictures that a consumer was too slow for.",
+            (),
+            lambda: {(): twin.missed},
+        )
         self.consumers = make.gauge("rfedge_twin_consumers", "Consumers that watch the twin.")
         self.ended = make.counter(
             "rfedge_twin_consumers_ended",
@@ -89,7 +77,12 @@ class TwinMetrics:
         )
         self.nats_missed: Callable[[], int] = int
         """Returns the number of pictures that were not published so far; read at each scrape."""
-        make.collector(NATS_DROPPED, ReadCounter(NATS_DROPPED, {"": lambda: self.nats_missed()}))
+        make.read(
+            "rfedge_twin_nats_dropped_total",
+            "Pictures that NATS was too slow, too small or away for.",
+            (),
+            lambda: {(): self.nats_missed()},
+        )
         for kind in NOTICE_KINDS:
             self.notices.labels(kind)
         for reason in ConsumerEnd:
@@ -103,26 +96,3 @@ class TwinMetrics:
         self.notices.labels(notice.kind).inc()
         if isinstance(notice.subject, ObjectAhead):
             self.notice_age.observe(notice.subject.unseen_s)
-
-
-class _Ages(Collector):
-    def __init__(self, family: Family, ages_s: Callable[[], Mapping[str, float]]) -> None:
-        self._family = family
-        self._ages_s = ages_s
-
-    def describe(self) -> Iterable[Metric]:
-        return [self._empty()]
-
-    def collect(self) -> Iterable[Metric]:
-        metric, ages_s = self._empty(), self._ages_s()
-        if self._family.labels:
-            for vehicle_id, age_s in ages_s.items():
-                metric.add_metric([vehicle_id], age_s)
-        elif ages_s:
-            metric.add_metric([], max(ages_s.values()))
-        return [metric]
-
-    def _empty(self) -> GaugeMetricFamily:
-        return GaugeMetricFamily(
-            self._family.name, self._family.text, labels=list(self._family.labels)
-        )

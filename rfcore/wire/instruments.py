@@ -11,19 +11,15 @@ import platform
 import socket
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from http.server import ThreadingHTTPServer
 from importlib.metadata import version
 from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
-from prometheus_client.core import (
-    CounterMetricFamily,
-    GaugeMetricFamily,
-    Metric,
-)
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import MetricsHandler
 from prometheus_client.registry import Collector
 
@@ -40,6 +36,10 @@ class Family:
     kind: str
     text: str
     labels: tuple[str, ...] = ()
+
+
+Readings = Mapping[tuple[str, ...], float]
+"""Values of a metric by the values of its labels."""
 
 
 class Instruments:
@@ -74,6 +74,14 @@ class Instruments:
         self._declare(family)
         self.registry.register(collector)
 
+    def read(
+        self, name: str, text: str, labels: Sequence[str], values: Callable[[], Readings]
+    ) -> None:
+        """Declare a counter (``name`` ends in ``_total``) or gauge whose ``values`` are read."""
+        kind = "counter" if name.endswith("_total") else "gauge"
+        family = Family(name, kind, text, tuple(labels))
+        self.collector(family, _Read(family, values))
+
     def process(self) -> None:
         """Declare what this process is and what it uses: CPU, memory, descriptors."""
         build = {
@@ -88,8 +96,18 @@ class Instruments:
 
     def devices(self, record: DeviceRecord = DEVICES) -> None:
         """Declare which OpenCL devices were opened and how often the CPU stood in for one."""
-        self.families += DEVICE_FAMILIES
-        self.registry.register(_Devices(record))
+        self.read(
+            "rfedge_opencl_device_info",
+            "1 for each OpenCL device that passed its self-check and was opened.",
+            ("device", "driver", "build"),
+            lambda: dict.fromkeys(list(record.opened), 1.0),
+        )
+        self.read(
+            "rfedge_opencl_fallbacks_total",
+            "Times the CPU drew instead: lost (a device failed, for good), full (one picture).",
+            ("reason",),
+            lambda: {("lost",): record.lost, ("full",): record.full},
+        )
 
     def _declare(self, family: Family) -> None:
         if not family.name.startswith("rfedge_"):
@@ -101,40 +119,26 @@ class Instruments:
         self.families.append(family)
 
 
-DEVICE_FAMILIES = (
-    Family(
-        "rfedge_opencl_device_info",
-        "gauge",
-        "1 for each OpenCL device that passed its self-check and was opened.",
-        ("device", "driver", "build"),
-    ),
-    Family(
-        "rfedge_opencl_fallbacks_total",
-        "counter",
-        "Times the CPU drew instead: lost (a device failed, for good), full (one picture).",
-        ("reason",),
-    ),
-)
+class _Read(Collector):
+    """A metric whose values are read from elsewhere at each scrape."""
 
+    def __init__(self, family: Family, values: Callable[[], Readings]) -> None:
+        self._family = family
+        self._values = values
 
-class _Devices(Collector):
-    """Reads a record of devices when it is asked."""
-
-    def __init__(self, record: DeviceRecord) -> None:
-        self._record = record
+    def describe(self) -> Iterable[Metric]:
+        return [self._empty()]
 
     def collect(self) -> Iterable[Metric]:
-        """Return the info of each device and the fallbacks."""
-        info, fallbacks = DEVICE_FAMILIES
-        gauge = GaugeMetricFamily(info.name, info.text, labels=info.labels)
-        for opened in list(self._record.opened):
-            gauge.add_metric(opened, 1)
-        counter = CounterMetricFamily(
-            fallbacks.name.removesuffix("_total"), fallbacks.text, labels=fallbacks.labels
-        )
-        counter.add_metric(("lost",), self._record.lost)
-        counter.add_metric(("full",), self._record.full)
-        return (gauge, counter)
+        metric = self._empty()
+        for labels, value in self._values().items():
+            metric.add_metric(labels, value)
+        return [metric]
+
+    def _empty(self) -> CounterMetricFamily | GaugeMetricFamily:
+        name, kind, text, labels = astuple(self._family)
+        made = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
+        return made(name, text, labels=labels)
 
 
 PROCESS_FAMILIES = (
