@@ -244,11 +244,8 @@ def give_way(nice: int) -> None:
 def work_when_idle() -> None:
     """Let the calling thread, and what it starts, work only while a processor is idle.
 
-    Sets SCHED_IDLE, see sched(7).
-
-    The lowest nice value is not enough. Whoever wakes displaces a thread of SCHED_IDLE at once, one
-    of nice 19 not always: beside four vehicles, a process of nice 19 that renders took the p99 of
-    decoding from 58 to 78 ms, one of SCHED_IDLE to 62.
+    Sets SCHED_IDLE, see sched(7). The lowest nice value is not enough: beside four vehicles it took
+    the p99 of decoding from 58 to 78 ms, SCHED_IDLE to 62.
     """
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 

@@ -21,11 +21,8 @@
 The rig's own axes are free; the camera's are OpenCV's. A drive states the intrinsics of its camera.
 Picture i of every drive was taken at the same instant.
 
-The 18 cameras of a car (``MOUNTS``) serve the CARLA recorder and streetgen. The published method
-names the number of cameras, not their places. These are three rows of six. Heights, reach and tilts
-follow the authors' later recorder (Maftej/rfdvc): low before the bumper and tilted up, at roof
-height and level, high and tilted down. Each row looks to the front, 45 degrees to either side, to
-both sides and back.
+The 18 cameras of a car (``MOUNTS``) serve the CARLA recorder and streetgen: three rows of six,
+whose heights, reach and tilts follow the published method's later recorder (Maftej/rfdvc).
 """
 
 from __future__ import annotations

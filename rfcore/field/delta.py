@@ -12,9 +12,7 @@ splats, ``added.means`` and so on; then for each level of detail of the version,
 scales and opacities minus the full level's, minus the base's difference. Streams of zeros are left
 out. Quantiser steps are the base's; decoding does not round.
 
-Measured on the sample's field of 300,000 splats (7.7 MB), fine-tuned to the 24 frames of its empty
-drive: 1.56 MB without its levels and with every difference; 1.08 MB, and 0.11 of 3.4 dB less, where
-higher bands of colours that differ by one step keep the base's (``SMALLEST_BAND``).
+A field of 7.7 MB fine-tuned to 24 frames takes 1.08 MB.
 """
 
 from __future__ import annotations

@@ -5,16 +5,14 @@ the pixels. That is the derivative of the picture's sum with respect to the spla
 trainer's backward pass computes it. Without cameras it is estimated as opacity times the area that
 the splat could cover as seen from the middle of the field.
 
-Measured on the first sample (150k splats, 27.1 dB), half / a quarter / a tenth of the splats, with
-no compensation: contributions 24.2 / 18.5 / 13.5 dB, the estimate 23.2 / 16.9 / 11.8 dB, opacity
-times area alone 18.8 / 11.0 / 7.4 dB, random 17.7 / 12.6 / 9.4 dB.
+Half / a tenth of the first sample's splats, 27.1 dB as a whole: 24.2 / 13.5 dB by contributions,
+23.2 / 11.8 by the estimate, 17.7 / 9.4 at random.
 
 A splat is seen from few directions along a street, so most of its 45 higher coefficients hardly
 matter. ``frugal_colours`` chooses whole numbers that change little where a splat is seen and take
 few bits, by coordinate descent on ``e' G e`` + ``price`` x bits, with ``G`` the splat's matrix
-of ``seen_directions`` and bits by the frequencies of each coefficient's numbers. Measured on the
-sample street (300k splats, step 1/32): the higher coefficients take 0.90 MB instead of 3.8 at
-0.00 dB, 0.41 MB at -0.07 dB.
+of ``seen_directions`` and bits by the frequencies of each coefficient's numbers: 0.90 MB instead of
+3.8 at the same quality (sample street).
 """
 
 from __future__ import annotations

@@ -12,8 +12,7 @@ of detail that ends there, ``detail_10``. So the first bytes of a file are enoug
 level (``detail_ends``). Within a band splats lie along a Morton curve, so that neighbours share a
 block.
 
-Measured on the first sample (150k splats, SH 3, three levels): 3.03 MB, 20.2 bytes a splat, 8.1 %
-of the raw 37.4 MB, at a loss of 0.05 dB on the held-out drive.
+The first sample takes 20 bytes a splat, 8 % of the raw form, at a loss of 0.05 dB.
 """
 
 from __future__ import annotations

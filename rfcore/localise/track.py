@@ -144,9 +144,8 @@ def begin_track(
     that alignment still moves is aligned again, at most ``alignments`` times, with two renders or
     three each.
 
-    A track that is followed was right a moment ago, one that begins may have been anywhere. Of
-    tries 0.5 to 2.5 m off in the sample's street, two thirds of those that passed the checks of a
-    followed track were 0.1 to 2.3 m wrong. So near surfaces must lie where the picture has them.
+    A track that begins may be anywhere: of tries 0.5 to 2.5 m off, two thirds of those that passed
+    the checks of a followed track were wrong. So near surfaces must lie where the picture has them.
     """
     track = None
     for _ in range(alignments):
@@ -313,10 +312,7 @@ def _checked(
 
     The first step of a track is predicted so loosely that alignment may have ended where only
     distant surfaces agree. It is therefore aligned again from coarse to fine, and must stay where
-    it is. (Hypothesis found a pose 0.2 m off, whose finest level alone still moved it by 0.6 px;
-    all levels move it by 2.3, to the right one.) A later picture that is off by enough to be drawn
-    again is aligned from coarse to fine, too, since its prediction was wrong by more than the
-    finest level reaches (cars that turn at five pictures a second: two renders more left 1.5 px).
+    it is; so is a later picture that is off by more than the finest level reaches.
     """
     view, renders = render_at(made.world_from_cam), made.renders + 1
     template = Template.of(view)

@@ -41,9 +41,8 @@ class RandomStart:
     cameras look, or, if their axes do not meet, the distance between cameras. A point is kept if
     ``seen_by`` cameras have it in view.
 
-    Measured on the fox (docs/how-to/training.md): from 0.2 to 8 times with two cameras, and a tenth
-    of the points at the farthest, held-out pictures reach 19.9 dB, with these values 26.2 dB;
-    Gaussians near a camera that few others see are learned by heart.
+    Closer or farther points cost decibels on held-out pictures (docs/how-to/training.md): Gaussians
+    near a camera that few others see are learned by heart.
     """
 
     nearest: float = 0.5
