@@ -24,20 +24,7 @@ from rfedge.arguments import JSON
 from rfedge.evaluate.savings import slice_nals
 from rfedge.results import make_result, provenance, write_result
 
-
-@dataclass(frozen=True)
-class IntraCoding:
-    """Settings of x264, one thread."""
-
-    crf: float = 23.0
-    rate_hz: int = 10
-    preset: str = "medium"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.crf <= 51:
-            raise InvalidInput("crf", f"{self.crf} is outside 0..51")
-        if not 1 <= self.rate_hz <= 120:
-            raise InvalidInput("rate_hz", f"{self.rate_hz} is outside 1..120")
+PRESET = "medium"
 
 
 @dataclass(frozen=True)
@@ -60,7 +47,7 @@ class SceneSizes:
         )
 
 
-def intra_bytes(rgb: Rgb, coding: IntraCoding) -> int:
+def intra_bytes(rgb: Rgb, crf: float, rate_hz: int) -> int:
     """Return the bytes of a picture's slices, start codes left out, coded alone.
 
     Raises ``CodecError`` if x264 fails.
@@ -68,37 +55,32 @@ def intra_bytes(rgb: Rgb, coding: IntraCoding) -> int:
     picture = i420_from_rgb(rgb)
     width, height = (side + side % 2 for side in picture.size_px)
     options = EncoderOptions(
-        (width, height),
-        coding.preset,
-        coding.crf,
-        params={"threads": "1"},
-        tune=None,
-        rate_hz=coding.rate_hz,
+        (width, height), PRESET, crf, params={"threads": "1"}, tune=None, rate_hz=rate_hz
     )
     (unit,) = encode_pictures(options, [(picture, PictureKind.CHOSEN)])
     return sum(map(len, slice_nals(unit)))
 
 
-def sizes_of(folders: Sequence[Path], coding: IntraCoding) -> Iterator[SceneSizes]:
-    """Code every picture of built scenes.
+def sizes_of(job: EvalIntraSize) -> Iterator[SceneSizes]:
+    """Code every picture of the scenes.
 
     Raises ``DatasetError`` for a folder that is none, or whose pictures differ in size.
     """
-    for folder in folders:
+    for folder in job.scenes:
         name, samples = _build(folder)
         pictures = [read_rgb(path) for path in sorted(folder.glob("*/images/*.png"))]
         shapes = {picture.shape[:2] for picture in pictures}
         if len(shapes) != 1:
             raise DatasetError(f"{folder}: pictures of {len(shapes)} sizes where one is needed")
         ((height, width),) = shapes
-        sizes = tuple(intra_bytes(picture, coding) for picture in pictures)
+        sizes = tuple(intra_bytes(picture, job.crf, job.rate_hz) for picture in pictures)
         yield SceneSizes(folder, name, samples, (width, height), sizes)
 
 
-def write_sizes(path: Path, scenes: Sequence[SceneSizes], coding: IntraCoding) -> None:
+def write_sizes(path: Path, scenes: Sequence[SceneSizes], job: EvalIntraSize) -> None:
     """Write what was measured, with the command, the revision and the host."""
     content = {
-        "coding": {"preset": coding.preset, "crf": coding.crf, "rate_hz": coding.rate_hz},
+        "coding": {"preset": PRESET, "crf": job.crf, "rate_hz": job.rate_hz},
         "rows": [
             {
                 "scene": scene.scene,
@@ -134,14 +116,19 @@ class EvalIntraSize:
     json: Annotated[Path | None, JSON] = None
     """Also write the figures into this file."""
 
-    def run(self) -> None:
-        """Print a line for each scene."""
+    def __post_init__(self) -> None:
         if not self.scenes:
             raise InvalidInput("scenes", "no folder is named")
-        coding = IntraCoding(self.crf, self.rate_hz)
+        if not 0 <= self.crf <= 51:
+            raise InvalidInput("crf", f"{self.crf} is outside 0..51")
+        if not 1 <= self.rate_hz <= 120:
+            raise InvalidInput("rate_hz", f"{self.rate_hz} is outside 1..120")
+
+    def run(self) -> None:
+        """Print a line for each scene."""
         measured = []
-        for sizes in sizes_of(self.scenes, coding):
+        for sizes in sizes_of(self):
             print(sizes.line(), flush=True)
             measured.append(sizes)
         if self.json is not None:
-            write_sizes(self.json, measured, coding)
+            write_sizes(self.json, measured, self)

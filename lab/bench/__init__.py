@@ -93,11 +93,11 @@ def _rows_of(case: str, rows: Rows, field: Path | None, isa: str | None) -> Sequ
 
 
 def flattened(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row whose nested values stand beside the others, as ``outer.inner``."""
+    """Return a row whose nested values stand beside the others, as ``outer inner``."""
     flat: dict[str, Any] = {}
     for name, value in row.items():
-        if isinstance(value, dict):
-            flat.update({f"{name}.{inner}": ms for inner, ms in value.items()})
+        if isinstance(value, Mapping):
+            flat |= {f"{name} {inner}": one for inner, one in value.items()}
         else:
             flat[name] = value
     return flat

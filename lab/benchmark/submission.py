@@ -22,15 +22,13 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-
 from lab.benchmark.definition import Benchmark, score_rows
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.image import I420, read_rgb
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.tables import Range, Table
-from rfedge.evaluate.clips import CodedClip, Drive, luma_mse
-from rfedge.evaluate.ssim import luma_ssim
+from rfedge.evaluate.clips import CodedClip, Drive
+from rfedge.evaluate.rivals import CodedPictures
 from rfedge.results import as_json
 
 SUBMISSION = "submission.json"
@@ -316,15 +314,10 @@ def check_submission(
 
 def _clip(point: CodedPoint, drive: Drive) -> CodedClip:
     """Measure a point against the drive's own frames."""
+    cpu_ms = float("inf") if point.cpu_ms is None else point.cpu_ms
     pictures = point.pictures(drive.frames[0].size_px)
-    pairs = list(zip(pictures, drive.frames, strict=True))
-    return CodedClip(
-        point.point,
-        np.array(point.frame_bytes, np.int64),
-        np.array([luma_mse(*pair) for pair in pairs]),
-        np.array([luma_ssim(shown.y, frame.y) for shown, frame in pairs]),
-        float("inf") if point.cpu_ms is None else point.cpu_ms,
-    )
+    made = CodedPictures(point.frame_bytes, pictures, cpu_ms, float("inf"))
+    return made.measured(point.point, drive.frames)
 
 
 def _curve(drive: Drive, points: Sequence[CodedPoint], clips: Sequence[CodedClip]) -> object:

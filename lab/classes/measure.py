@@ -29,18 +29,17 @@ from rfedge.evaluate.clips import (
     QUICK,
     STEADY,
     Clip,
+    ClipCoder,
     CodedClip,
     Drive,
     DriveName,
     DriveOfField,
-    luma_mse,
     psnr_of_mse,
 )
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
-from rfedge.evaluate.performance import perform, seconds_left
+from rfedge.evaluate.performance import BoundedCoder, perform, seconds_left
 from rfedge.evaluate.rivals import CodedPictures, x264_lowdelay, x264_with_our_tools
 from rfedge.evaluate.runner import Run, coded_clip, program_version
-from rfedge.evaluate.ssim import luma_ssim
 from rfedge.jobs import CellStore
 from rfedge.report.tables import Table, text_table
 from rfedge.results import Result, rows_of
@@ -88,24 +87,8 @@ def read_groups(name: DriveName, drive: Drive) -> list[NDArray[np.uint8]]:
     return found
 
 
-class PictureCoder(Protocol):
+class PictureCoder(ClipCoder, BoundedCoder, Protocol):
     """A coder of clips that also shows the pictures that it decodes."""
-
-    @property
-    def name(self) -> str:
-        """The label, with every setting that changes the result."""
-
-    @property
-    def points(self) -> Sequence[float]:
-        """The operating points, from best to worst."""
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """The points of the best and of the worst quality that there are."""
-
-    @property
-    def version(self) -> str:
-        """Everything that the result depends on besides name, point and clip."""
 
     def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
         """Code and decode ``frames`` with low delay."""
@@ -149,18 +132,10 @@ class ClassCoder:
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames``, which may be the beginning of those of the groups."""
         made = self.coder.pictures(frames, rate_hz, point)
-        pairs = list(zip(made.decoded, frames, strict=True))
-        groups = self.groups[: len(frames)]
-        errors = np.array([_group_sse(*p, g) for p, g in zip(pairs, groups, strict=True)])
-        return CodedClip(
-            point,
-            np.array(made.frame_bytes, np.int64),
-            np.array([luma_mse(*pair) for pair in pairs]),
-            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
-            made.cpu_ms,
-            {_note(name): tuple(errors[:, i].tolist()) for i, name in enumerate(GROUPS)},
-            made.decoder_cpu_ms,
-        )
+        grouped = zip(made.decoded, frames, self.groups[: len(frames)], strict=True)
+        errors = np.array([_group_sse(*each) for each in grouped])
+        notes = {_note(name): tuple(errors[:, i].tolist()) for i, name in enumerate(GROUPS)}
+        return made.measured(point, frames, **notes)
 
 
 def _note(group: str) -> str:

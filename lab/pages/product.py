@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+from lab.bench import flattened
 from lab.pages.ladder import ladder_parts, write_ladder_figure
 from lab.report import Draw, Report, bars, folded
 from rfcore.errors import InvalidInput
@@ -176,21 +176,10 @@ def _demo_parts(result: Result) -> Iterator[Table | str]:
 
 
 def _bench_parts(result: Result) -> Iterator[Table | str]:
-    rows = [_flat(row) for row in result["rows"]]
+    rows = [flattened(row) for row in result["rows"]]
     if not rows:
         raise InvalidInput("result", "a bench has no rows")
     yield Table("", named_columns(dict.fromkeys(n for row in rows for n in row)), rows)
-
-
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row whose nested values stand beside the others, as ``outer inner``."""
-    flat: dict[str, Any] = {}
-    for name, value in row.items():
-        if isinstance(value, Mapping):
-            flat |= {f"{name} {inner}": ms for inner, ms in value.items()}
-        else:
-            flat[name] = value
-    return flat
 
 
 TRAINING = (
@@ -230,7 +219,7 @@ def _plain_parts(result: Result) -> Iterator[Table | str]:
     """Yield every list of rows under the names of its fields."""
     for name, rows in result.items():
         if isinstance(rows, list) and rows and isinstance(rows[0], Mapping):
-            flat = [_flat(row) for row in rows]
+            flat = [flattened(row) for row in rows]
             yield Table(name, named_columns(dict.fromkeys(n for row in flat for n in row)), flat)
 
 

@@ -33,6 +33,10 @@ STEADY = slice(1, None)
 """Every frame but the first, which a stream sends once and a clip of 24 frames counts too much."""
 
 
+Notes = tuple[float | str, ...]
+"""A value per frame."""
+
+
 @dataclass(frozen=True)
 class CodedClip:
     """A clip coded at one operating point, a value per frame in time order.
@@ -47,7 +51,7 @@ class CodedClip:
     luma_mse: NDArray[np.float64]
     ssim: NDArray[np.float64]
     cpu_ms: float
-    notes: Mapping[str, tuple[float | str, ...]] = field(default_factory=dict)
+    notes: Mapping[str, Notes] = field(default_factory=dict)
     """Notes of the method on each frame, by name: references chosen, bits by kind..."""
     receiver_cpu_ms: float | None = None
     """Processor time of the receiver over the whole clip; None if the method does not tell."""

@@ -31,9 +31,8 @@ from rfcore.image import I420
 from rfcore.views import FieldView
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
-from rfedge.evaluate.clips import CodedClip, luma_mse, luma_sse
+from rfedge.evaluate.clips import CodedClip, Notes, luma_sse
 from rfedge.evaluate.rivals import CodedPictures
-from rfedge.evaluate.ssim import luma_ssim
 from rfedge.offline import Arrival, CodedFrame, FrameInput, decode_promised, encode_frames
 
 LIMITS = (1.0, 51.0)
@@ -176,9 +175,8 @@ class FieldCoder:
         """
         del rate_hz
         coded, made = self._coded(frames, point)
-        pairs = list(zip(made.decoded, frames, strict=True))
         packets = [coded_frame.encoded.packet for coded_frame in coded]
-        notes: dict[str, tuple[float | str, ...]] = {
+        notes: dict[str, Notes] = {
             "references": tuple(references_name(packet.references) for packet in packets),
             "slice_bytes": tuple(len(packet.payload) for packet in packets),
             "relit": tuple(float(packet.relit) for packet in packets),
@@ -187,17 +185,9 @@ class FieldCoder:
             ),
         }
         if self._foregrounds:
-            masked = zip(pairs, self._foregrounds, strict=False)
-            notes["foreground_sse"] = tuple(luma_sse(*pair, mask) for pair, mask in masked)
-        return CodedClip(
-            point,
-            np.array(made.frame_bytes),
-            np.array([luma_mse(*pair) for pair in pairs]),
-            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
-            made.cpu_ms,
-            notes,
-            made.decoder_cpu_ms,
-        )
+            masked = zip(made.decoded, frames, self._foregrounds, strict=False)
+            notes["foreground_sse"] = tuple(luma_sse(*each) for each in masked)
+        return made.measured(point, frames, **notes)
 
     def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
         """Return what ``code`` measures; takes and raises the same."""

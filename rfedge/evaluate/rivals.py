@@ -26,7 +26,7 @@ from rfcore.codec.h264.config import even_size_px
 from rfcore.codec.h264.ffmpeg import picture_of, video_frame
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.clips import CodedClip, luma_mse
+from rfedge.evaluate.clips import CodedClip, Notes, luma_mse
 from rfedge.evaluate.ssim import luma_ssim
 
 
@@ -72,6 +72,19 @@ class CodedPictures:
     cpu_ms: float
     decoder_cpu_ms: float
 
+    def measured(self, point: float, frames: Sequence[I420], **notes: Notes) -> CodedClip:
+        """Return the clip, coded at ``point``, with its errors against the camera's ``frames``."""
+        pairs = list(zip(self.decoded, frames, strict=True))
+        return CodedClip(
+            point,
+            np.array(self.frame_bytes, np.int64),
+            np.array([luma_mse(*pair) for pair in pairs]),
+            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            self.cpu_ms,
+            notes,
+            self.decoder_cpu_ms,
+        )
+
 
 @dataclass(frozen=True)
 class Rival:
@@ -105,16 +118,7 @@ class Rival:
         """
         if not frames:
             raise InvalidInput("frames", "a rival needs at least one frame")
-        made = self.pictures(frames, rate_hz, point)
-        pairs = list(zip(made.decoded, frames, strict=True))
-        return CodedClip(
-            point,
-            np.array(made.frame_bytes),
-            np.array([luma_mse(*pair) for pair in pairs]),
-            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
-            made.cpu_ms,
-            receiver_cpu_ms=made.decoder_cpu_ms,
-        )
+        return self.pictures(frames, rate_hz, point).measured(point, frames)
 
     def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
         """Return what ``code`` measures; raises as it does, but does not look at the sizes."""

@@ -25,6 +25,7 @@ from rfcore.field.quality import LevelOfDetail
 from rfcore.field.similarity import Similarity, moved
 from rfcore.image import Rgb, rgb_from_colour
 from rfcore.metrics import psnr
+from rfcore.update.passes import spread
 from rfcore.views import PosedPicture
 
 UNITS = {"": 1.0, "centimetres": 100.0, "millimetres": 1000.0, "hundreds of metres": 0.01}
@@ -179,7 +180,7 @@ def check_field(
     """
     if not pictures:
         raise InvalidInput("drive", "has no pictures")
-    view, seen = _FieldInDrive(field), _spread(pictures, PAIRS)
+    view, seen = _FieldInDrive(field), spread(pictures, PAIRS)
     best, tried = AS_GIVEN, 1
     as_given_db = best_db = _psnr_db(view, seen, AS_GIVEN)
     mode = _mode_fit(field, seen, best, best_db)
@@ -209,7 +210,7 @@ def pairs_picture(
     """Return four camera pictures, each beside the field's render, and their PSNR in dB."""
     view = _FieldInDrive(field)
     rows, values_db = [], []
-    for picture in _spread(pictures, PAIRS):
+    for picture in spread(pictures, PAIRS):
         camera, render = picture.read(), rgb_from_colour(view.colour(picture.camera, convention))
         values_db.append(psnr(render, camera))
         rows.append(_shrunk(np.hstack([camera, render])))
@@ -286,7 +287,7 @@ def _best_convention(
 ) -> tuple[Convention, float, int]:
     """Return the best convention, its PSNR in dB, and how many were tried."""
     conventions = list(known_conventions(nerfstudio))
-    probes = [_Probe.of(picture) for picture in _spread(seen, PROBES)]
+    probes = [_Probe.of(picture) for picture in spread(seen, PROBES)]
     ranked = sorted(conventions, key=lambda guess: _probed_error(view, probes, guess))
     results = [(_psnr_db(view, seen, guess), guess) for guess in ranked[:FINALISTS]]
     best_db, best = max(results, key=lambda result: result[0])
@@ -315,12 +316,6 @@ def _psnr_db(
 ) -> float:
     renders = [(rgb_from_colour(view.colour(p.camera, convention)), p.read()) for p in pictures]
     return float(np.mean([psnr(render, seen) for render, seen in renders]))
-
-
-def _spread(pictures: Sequence[PosedPicture], count: int) -> list[PosedPicture]:
-    """Return ``count`` pictures spread evenly over the drive, or all if there are fewer."""
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, count).round().astype(int))
-    return [pictures[i] for i in chosen]
 
 
 def _shrunk(rgb: Rgb) -> Rgb:

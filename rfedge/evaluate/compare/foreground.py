@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.clips import STEADY, Clip, CodedClip, luma_mse, luma_sse, psnr_of_mse
+from rfedge.evaluate.clips import STEADY, Clip, CodedClip, luma_sse, psnr_of_mse
 from rfedge.evaluate.compare.rows import ForegroundRow
 from rfedge.evaluate.rate_curve import RateCurve, bd_rate_percent
 from rfedge.evaluate.rivals import Rival, x264_for_psnr
-from rfedge.evaluate.ssim import luma_ssim
 
 MACROBLOCK_PX = 16
 DIFFERENT_LEVELS = 12
@@ -106,20 +105,14 @@ class ForegroundCoder:
             composed(decoded, render, block)
             for decoded, render, block in zip(made.decoded, self.renders, blocks, strict=False)
         ]
-        mask_bytes = [len(zlib.compress(np.packbits(block).tobytes(), 9)) for block in blocks]
-        pairs = list(zip(shown, frames, strict=True))
-        return CodedClip(
-            point,
-            np.array(made.frame_bytes, np.int64) + np.array(mask_bytes, np.int64),
-            np.array([luma_mse(*pair) for pair in pairs]),
-            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
-            made.cpu_ms,
-            {
-                "foreground_sse": tuple(
-                    luma_sse(*pair, mask) for pair, mask in zip(pairs, self.masks, strict=False)
-                )
-            },
-        )
+        sizes = [
+            size + len(zlib.compress(np.packbits(block).tobytes(), 9))
+            for size, block in zip(made.frame_bytes, blocks, strict=True)
+        ]
+        masked = zip(shown, frames, self.masks, strict=False)
+        errors = tuple(luma_sse(*each) for each in masked)
+        composed_pictures = replace(made, frame_bytes=sizes, decoded=shown)
+        return composed_pictures.measured(point, frames, foreground_sse=errors)
 
 
 def foreground_row(
