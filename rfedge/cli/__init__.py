@@ -16,11 +16,11 @@ from rfedge.cli.measure import Eval, LoadTest
 from rfedge.cli.render import Render
 from rfedge.cli.services import Certs, Watch
 from rfedge.cli.size import Size
-from rfedge.cli.train import Train
 from rfedge.cli.twin import Twin
 from rfedge.demo import Demo
 from rfedge.link import LinkSettings
 from rfedge.program import CONFIG, run_program
+from rfedge.training import Train
 
 __all__ = ["main", "parse"]
 

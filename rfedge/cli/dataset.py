@@ -19,6 +19,7 @@ from rfedge.arguments import (
     open_field,
     parse_size,
 )
+from rfedge.datasets import DatasetRecordCarla
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -202,69 +203,6 @@ def _shown(console: Console) -> Iterator[Callable[[str], None]]:
         return
     with console.status("reading pictures") as status:
         yield status.update
-
-
-@dataclass(frozen=True)
-class DatasetRecordCarla:
-    """Drive 18 cameras along a street of a running CARLA server, both ways, into a dataset."""
-
-    out: Annotated[Path, FOLDER]
-    """The folder to make: pictures and transforms.json."""
-    host: Annotated[str, arg(metavar="HOST")] = "127.0.0.1"
-    """Where the server runs."""
-    port: Annotated[int, arg(metavar="PORT")] = 2000
-    """Its RPC port."""
-    town: Annotated[str | None, arg(metavar="MAP")] = None
-    """Load this map first, such as Town10HD; default: the one that is running."""
-    spawn: int = 0
-    """Start at this spawn point of the map."""
-    stations: int = 20
-    """Places along the lane where all cameras take a picture, each way."""
-    spacing_m: float = 4.0
-    """Metres between them."""
-    both_ways: bool = True
-    """Drive back on the lane of the other direction."""
-    keep_parked: bool = False
-    """Keep the map's own parked vehicles in the pictures."""
-    cameras: Annotated[str, arg(metavar="NAME,...")] = "all"
-    """`all`, or names from the rig, separated by commas; a drive is `mid_front`."""
-    size: Annotated[str, SIZE] = "1920x1080"
-    """Size of the pictures, WIDTHxHEIGHT px."""
-    fov_deg: float = 90.0
-    """Horizontal field of view, degrees."""
-    timeout_s: float = 30.0
-    """Give up when the server does not answer for so long, seconds."""
-
-    def run(self) -> None:
-        """Connect, record, and write the dataset."""
-        from rfcore.dataset.rig import mounts_named
-        from rfcore.errors import RfedgeError
-        from rfcore.extras import needs
-        from rfcore.files import whole_folder
-        from rfedge.datasets.carla import CarlaRecorder, CarlaRecordSettings
-
-        settings = CarlaRecordSettings(
-            spawn=self.spawn,
-            stations=self.stations,
-            spacing_m=self.spacing_m,
-            both_ways=self.both_ways,
-            keep_parked=self.keep_parked,
-            mounts=mounts_named(self.cameras),
-            size_px=parse_size(self.size),
-            fov_deg=self.fov_deg,
-            timeout_s=self.timeout_s,
-        )
-        with needs("carla"):
-            import carla
-        with whole_folder(self.out) as folder:
-            try:
-                client = carla.Client(self.host, self.port)
-                client.set_timeout(self.timeout_s)
-                world = client.load_world(self.town) if self.town else client.get_world()
-                count = CarlaRecorder(carla, world, settings).record(folder)
-            except RuntimeError as error:
-                raise RfedgeError(f"CARLA at {self.host}:{self.port}: {error}") from error
-        print(f"{self.out}: {count} pictures")
 
 
 @dataclass(frozen=True)

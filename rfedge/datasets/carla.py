@@ -17,18 +17,18 @@ import math
 import queue
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.rig import RIG, Mount
+from rfcore.dataset.rig import Mount, mounts_named
 from rfcore.dataset.source import SourceCamera
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import write_png
+from rfedge.datasets import DatasetRecordCarla
 
 
 def pose_from_carla(world_from_sensor: Sequence[Sequence[float]]) -> Pose:
@@ -60,37 +60,17 @@ SETTLING_TICKS = 2
 """An image shows the transform of the tick before its own at the earliest."""
 
 
-@dataclass(frozen=True)
-class CarlaRecordSettings:
-    """Options of a recording; ``spawn`` is the index of one of the map's spawn points."""
-
-    spawn: int = 0
-    stations: int = 20
-    spacing_m: float = 4.0
-    both_ways: bool = True
-    keep_parked: bool = False
-    mounts: tuple[Mount, ...] = RIG
-    size_px: tuple[int, int] = (1920, 1080)
-    fov_deg: float = 90.0
-    vehicle: str = "vehicle.tesla.model3"
-    tick_s: float = 0.05
-    timeout_s: float = 30.0
-
-    def __post_init__(self) -> None:
-        if self.stations < 1 or self.spawn < 0:
-            raise InvalidInput("stations", f"{self.stations} at spawn point {self.spawn}")
-        for name in ("spacing_m", "tick_s", "timeout_s"):
-            if not getattr(self, name) > 0:
-                raise InvalidInput(name, f"{getattr(self, name)} must be above 0")
+VEHICLE, TICK_S = "vehicle.tesla.model3", 0.05
 
 
 class CarlaRecorder:
     """Records in ``world`` with the client library, the module ``carla``."""
 
-    def __init__(self, carla: Any, world: Any, settings: CarlaRecordSettings) -> None:
+    def __init__(self, carla: Any, world: Any, settings: DatasetRecordCarla) -> None:
         self._carla = carla
         self._world = world
         self._settings = settings
+        self._mounts = mounts_named(settings.cameras)
         self._camera = SourceCamera(intrinsics_of_fov(*settings.size_px, settings.fov_deg))
 
     def record(self, folder: Path) -> int:
@@ -107,7 +87,7 @@ class CarlaRecorder:
             for i, station in enumerate(stations):
                 car.set_transform(station)
                 frame = [self._world.tick() for _ in range(SETTLING_TICKS)][-1]
-                for mount, queued in zip(self._settings.mounts, images, strict=True):
+                for mount, queued in zip(self._mounts, images, strict=True):
                     name = f"images/{i:04d}_{mount.name}.png"
                     written.append(self._written(folder, name, self._image(queued, frame)))
         write_transforms(folder, written, None)
@@ -143,7 +123,7 @@ class CarlaRecorder:
         before = self._world.get_settings()
         settings = self._world.get_settings()
         settings.synchronous_mode = True
-        settings.fixed_delta_seconds = self._settings.tick_s
+        settings.fixed_delta_seconds = TICK_S
         self._world.apply_settings(settings)
         try:
             yield
@@ -163,7 +143,7 @@ class CarlaRecorder:
 
     @contextmanager
     def _car(self, station: Any) -> Iterator[Any]:
-        blueprint = self._world.get_blueprint_library().find(self._settings.vehicle)
+        blueprint = self._world.get_blueprint_library().find(VEHICLE)
         car = self._world.spawn_actor(blueprint, station)
         try:
             car.set_simulate_physics(False)
@@ -176,7 +156,7 @@ class CarlaRecorder:
         blueprint = self._blueprint()
         with ExitStack() as stack:
             queues = []
-            for mount in self._settings.mounts:
+            for mount in self._mounts:
                 place = _transform(self._carla, mount)
                 sensor = self._world.spawn_actor(blueprint, place, attach_to=car)
                 stack.callback(sensor.destroy)

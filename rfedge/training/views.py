@@ -8,7 +8,7 @@ write them). 0 means unknown.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isqrt
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from rfcore.dataset.source import read_points
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.train.start import points_from_depth
 from rfcore.views import PointCloud, PosedPicture
+from rfedge.training import Train
 
 POINTS = 300_000
 """Approximate number of points to make: twice what a run draws by default."""
@@ -81,51 +82,26 @@ def _points_of(picture: PosedPicture, path: Path, count: int) -> PointCloud:
     return points_from_depth(picture.camera, rgb, depth_m, step_px)
 
 
-@dataclass(frozen=True)
-class ViewChoice:
-    """Which pictures to read; ``held_out`` is another dataset, ``holdout`` is N of every Nth."""
-
-    dataset: Path
-    held_out: Path | None = None
-    holdout: int | None = None
-    percent: float = 100.0
-    """Share of the pictures that are not held out."""
-    points: Path | None = None
-    """A .ply instead of the dataset's own points."""
-    depths: Path | None = None
-    """A folder of depth maps to take points from instead."""
-    size_px: tuple[int, int] | None = None
-    undistort: bool = False
-
-    def __post_init__(self) -> None:
-        if self.held_out is not None and self.holdout is not None:
-            raise InvalidInput("holdout", "goes without --held-out: choose one of the two")
-        if self.points is not None and self.depths is not None:
-            raise InvalidInput("depths", "goes without --points: choose one of the two")
-        if not 0 < self.percent <= 100:
-            raise InvalidInput("views_percent", f"{self.percent} is outside 0..100")
-
-
-def read_views(choice: ViewChoice) -> tuple[Dataset, Dataset | None]:
+def read_views(job: Train) -> tuple[Dataset, Dataset | None]:
     """Return the pictures to train on and those to measure on, around the same origin."""
-    distortion = Distortion.UNDISTORT if choice.undistort else Distortion.REFUSE
-    dataset = read_dataset(choice.dataset, distortion=distortion, size_px=choice.size_px)
+    distortion = Distortion.UNDISTORT if job.undistort else Distortion.REFUSE
+    dataset = read_dataset(job.dataset, distortion=distortion, size_px=job.size_px)
     held_out = None
-    if choice.held_out is not None:
+    if job.held_out is not None:
         held_out = read_dataset(
-            choice.held_out,
+            job.held_out,
             tile_origin=dataset.tile_origin,
             distortion=distortion,
-            size_px=choice.size_px,
+            size_px=job.size_px,
         )
-    elif choice.holdout is not None:
-        dataset, held_out = split_every(dataset, choice.holdout)
-    if choice.points is not None:
-        points = localised(read_points(choice.points), dataset.tile_origin)
+    elif job.holdout is not None:
+        dataset, held_out = split_every(dataset, job.holdout)
+    if job.points is not None:
+        points = localised(read_points(job.points), dataset.tile_origin)
         dataset = replace(dataset, points=points)
-    dataset = replace(dataset, pictures=share_of_views(dataset.pictures, choice.percent))
-    if choice.depths is not None:
-        points = points_from_depth_maps(dataset.pictures, choice.depths)
+    dataset = replace(dataset, pictures=share_of_views(dataset.pictures, job.views_percent))
+    if job.depths is not None:
+        points = points_from_depth_maps(dataset.pictures, job.depths)
         dataset = replace(dataset, points=points)
     return dataset, held_out
 

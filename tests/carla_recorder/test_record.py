@@ -3,6 +3,7 @@
 No CARLA server is run here: the stand-in answers the calls the recorder makes.
 """
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,9 +14,10 @@ import pytest
 from rfcore.dataset import read_dataset
 from rfcore.dataset.rig import RIG, mounts_named
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.datasets.carla import CarlaRecorder, CarlaRecordSettings
+from rfedge.datasets import DatasetRecordCarla
+from rfedge.datasets.carla import CarlaRecorder
 
-SMALL = CarlaRecordSettings(stations=3, spacing_m=5.0, size_px=(32, 18), timeout_s=0.2)
+SMALL = DatasetRecordCarla(Path("out"), stations=3, spacing_m=5.0, size="32x18", timeout_s=0.2)
 
 
 class Waypoint:

@@ -12,8 +12,8 @@ from lab.servers.ray import require_resumed, train_tiles
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.tile_manifest import read_publication
 from rfedge.cli.field_tiles import FieldPublish
-from rfedge.cli.train import Train
 from rfedge.datasets.convert import SplitSettings, split_dataset
+from rfedge.training import Train
 from tests.train.conftest import write_drive
 
 OPTIONS = {"iterations": 60, "gaussians": 200, "threads": 1, "plain": True, "checkpoint_every": 20}

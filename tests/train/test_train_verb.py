@@ -14,11 +14,10 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field import load_field, save_field
 from rfcore.train.ngp import NgpModel, NgpTrainingConfig
 from rfedge.cli.dataset import DatasetConvert
-from rfedge.cli.train import Train
+from rfedge.training import Train
 from rfedge.training.loop import LoopLimits
 from rfedge.training.run import TrainingJob, train, training_result
 from rfedge.training.views import (
-    ViewChoice,
     read_depth_m,
     read_views,
     share_of_views,
@@ -188,7 +187,7 @@ def test_points_may_come_from_depth_maps(wall, tmp_path, suffix):
             np.save(tmp_path / f"{i}.npy", np.full((32, 48), 4.0, np.float32))
         else:
             cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((32, 48), 4000, np.uint16))
-    dataset, _ = read_views(ViewChoice(wall, depths=tmp_path))
+    dataset, _ = read_views(Train(wall, tmp_path / "f.rff", depths=tmp_path))
     assert len(dataset.points.xyz_m) == 3 * 32 * 48
     # OpenCV axes of a camera that looks along -z of the world
     np.testing.assert_allclose(dataset.points.xyz_m[:, 2], -4.0, rtol=1e-6)
@@ -196,14 +195,14 @@ def test_points_may_come_from_depth_maps(wall, tmp_path, suffix):
 
 def test_bad_depth_maps_are_refused_by_name(wall, tmp_path):
     with pytest.raises(DatasetError, match="holds no depth map"):
-        read_views(ViewChoice(wall, depths=tmp_path))
+        read_views(Train(wall, tmp_path / "f.rff", depths=tmp_path))
     for content in (np.zeros((5, 5), np.float32), np.zeros((32, 48, 3), np.float32)):
         np.save(tmp_path / "0.npy", content)
         with pytest.raises(DatasetError, match=r"0\.npy"):
-            read_views(ViewChoice(wall, depths=tmp_path))
+            read_views(Train(wall, tmp_path / "f.rff", depths=tmp_path))
     (tmp_path / "0.npy").write_bytes(b"nonsense")
     with pytest.raises(DatasetError, match=r"0\.npy"):
-        read_views(ViewChoice(wall, depths=tmp_path))
+        read_views(Train(wall, tmp_path / "f.rff", depths=tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -218,7 +217,7 @@ def test_a_picture_that_holds_no_depths_is_refused(wall, tmp_path, pixels, probl
     data = b"nonsense" if pixels is None else cv2.imencode(".png", pixels)[1].tobytes()
     (tmp_path / "0.png").write_bytes(data)
     with pytest.raises(DatasetError, match=problem):
-        read_views(ViewChoice(wall, depths=tmp_path))
+        read_views(Train(wall, tmp_path / "f.rff", depths=tmp_path))
 
 
 def test_a_depth_map_is_read_in_millimetres(tmp_path):
