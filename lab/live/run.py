@@ -6,7 +6,6 @@ for minutes.
 
 from __future__ import annotations
 
-import json
 import signal
 import socket
 import subprocess
@@ -23,6 +22,7 @@ from rich.console import Console
 from lab.live import EvalLive
 from lab.live.report import AgeRow, IngestRow, SourceRow, live_parts
 from lab.live.showing import PictureAges, TwinBed, agent, measure_age, measure_ingest
+from lab.servers.fleet import Lines, read_lines
 from lab.soak import slope_per_minute
 from lab.twin_reader import reading
 from rfcore.dataset import read_dataset
@@ -164,7 +164,7 @@ def measure_source(camera: LiveCamera, drive: Path, field: Path, work: Path) -> 
             watcher.start()
             kills = _kill_again_and_again(sender, camera)
             usage = watcher.stop()
-            return _row(camera, kills, _lines(report), ages.ages_ms, usage)
+            return _row(camera, kills, read_lines(report), ages.ages_ms, usage)
 
 
 def _await_pictures(report: Path, ages_ms: list[float], process: subprocess.Popen[bytes]) -> None:
@@ -189,15 +189,10 @@ def _kill_again_and_again(sender: Sender, camera: LiveCamera) -> int:
     return kills
 
 
-def _lines(report: Path) -> list[dict[str, Any]]:
-    whole = report.read_text().splitlines(keepends=True)
-    return [json.loads(line) for line in whole if line.endswith("\n")]
-
-
 def _row(
     camera: LiveCamera,
     kills: int,
-    lines: Sequence[dict[str, Any]],
+    lines: Lines,
     ages_ms: Sequence[float],
     usage: Any,
 ) -> SourceRow:

@@ -15,13 +15,13 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 from lab.rig import EvalRig
 from lab.rig.report import CameraRow, SessionRow
+from lab.servers.fleet import Lines, read_lines
 from lab.twin_reader import TwinReader
 from rfcore.dataset.rig import Rig, RigCamera, RigInstant, read_rig, read_rig_drive
 from rfcore.errors import RfedgeError
@@ -66,10 +66,6 @@ def instants_apart(pictures: Sequence[TwinPicture], cameras: int) -> int | None:
     return most
 
 
-Line = Mapping[str, Any]
-"""A line of an agent's report."""
-
-
 @dataclass(frozen=True)
 class Case:
     """One way to send the cameras of ``rig``; ``together``: in one session."""
@@ -89,7 +85,7 @@ class Case:
 class Outcome:
     """Results of a case: reports by vehicle, pictures shown, bytes on the link, memory."""
 
-    lines: Mapping[str, Sequence[Line]]
+    lines: Mapping[str, Lines]
     pictures: Sequence[TwinPicture]
     link_bytes: int
     agent_mb: float
@@ -145,7 +141,7 @@ def _outcome(job: EvalRig, case: Case, rig: Rig) -> Outcome:
         vehicles = _vehicles(job, case, rig, link)
         agent_mb = _run_together(vehicles, work)
     return Outcome(
-        lines={name: _lines(work / f"{name}.jsonl") for name in vehicles},
+        lines={name: read_lines(work / f"{name}.jsonl") for name in vehicles},
         pictures=pictures,
         link_bytes=int(json.loads(report.read_text())["uplink"]["bytes"]),
         agent_mb=agent_mb,
@@ -198,10 +194,6 @@ def _run_together(commands: Mapping[str, Sequence[str]], work: Path) -> float:
     return memory_kib * 1024 / 1e6
 
 
-def _lines(report: Path) -> list[Line]:
-    return [json.loads(line) for line in report.read_text().splitlines()]
-
-
 def _measured(
     case: Case, rig: Rig, drive: Sequence[RigInstant], outcome: Outcome
 ) -> tuple[list[CameraRow], SessionRow]:
@@ -222,7 +214,7 @@ def _measured(
 def _camera_row(
     case: Case,
     camera: RigCamera,
-    lines: Sequence[Line],
+    lines: Lines,
     seen: Sequence[tuple[PosedPicture, TwinPicture]],
 ) -> CameraRow:
     acked = [line for line in lines if line["result"] == "acked"]

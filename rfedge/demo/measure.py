@@ -27,7 +27,7 @@ from rfcore.image import I420, Rgb
 from rfcore.metrics import psnr, ssim
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfedge.evaluate.rivals import Rival, x264_for_psnr
-from rfedge.evaluate.savings import paper_savings_percent, slice_nals
+from rfedge.evaluate.savings import paper_savings, slice_nals
 
 MIN_POINTS = 4
 Quality = Callable[[I420, I420], float]
@@ -259,9 +259,8 @@ def _published_metric(outcome: DriveOutcome) -> dict[str, float]:
         camera = i420_from_rgb(pictures.camera)
         references = (pictures.render, outcome.elsewhere, grey)
         for reference, found in zip(references, savings.values(), strict=True):
-            found.append(
-                paper_savings_percent(camera, i420_from_rgb(reference), outcome.preset, outcome.crf)
-            )
+            shown = i420_from_rgb(reference)
+            found.append(paper_savings(camera, shown, outcome.preset, outcome.crf).percent)
     return {
         f"paper_savings_percent{name}": statistics.fmean(found) for name, found in savings.items()
     }

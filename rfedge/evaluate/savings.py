@@ -72,11 +72,6 @@ def paper_savings(camera: I420, render: I420, preset: str, crf: float) -> PaperS
     return savings_of_clip(published_clip(camera, render, preset, crf))
 
 
-def paper_savings_percent(camera: I420, render: I420, preset: str, crf: float) -> float:
-    """Return ``paper_savings(...).percent``."""
-    return paper_savings(camera, render, preset, crf).percent
-
-
 def slice_nals(access_unit: bytes) -> list[bytes]:
     """Return the slices of an access unit; raise ``CodecError`` if it has none."""
     nals = [nal for nal in split_nals(access_unit) if nal_type(nal) in (NAL_P, NAL_IDR)]

@@ -11,7 +11,7 @@ from lab.paper.run import (
 )
 from rfcore.errors import InvalidInput
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.evaluate.savings import paper_savings_percent
+from rfedge.evaluate.savings import paper_savings
 
 SMALL = Setting((64, 48), "downscaled", "medium", 23.0)
 
@@ -41,7 +41,7 @@ def test_the_savings_are_the_published_formula_of_the_bytes():
     expected = 100 * made["i_bytes"] / (made["i_bytes"] + made["p_bytes"])
     assert made["savings_percent"] == pytest.approx(expected)
     camera, render = (i420_from_rgb(reduced(picture(k), SMALL.size_px)) for k in (1, 2))
-    assert made["savings_percent"] == paper_savings_percent(camera, render, "medium", 23.0)
+    assert made["savings_percent"] == paper_savings(camera, render, "medium", 23.0).percent
 
 
 def test_a_finer_rate_factor_costs_more_and_shows_it():
