@@ -44,6 +44,10 @@ class DatasetRecordCarla:
     """Give up when the server does not answer for so long, seconds."""
 
     def __post_init__(self) -> None:
+        from rfcore.dataset.rig import mounts_named
+
+        mounts_named(self.cameras)
+        parse_size(self.size)
         if self.stations < 1 or self.spawn < 0:
             raise InvalidInput("stations", f"{self.stations} at spawn point {self.spawn}")
         for name in ("spacing_m", "timeout_s"):
