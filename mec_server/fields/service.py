@@ -82,8 +82,8 @@ class FieldShelf:
     def draw_once(self) -> None:
         """Warm up: draw one picture of the largest open field of splats.
 
-        The first picture of each thread, and the first pictures drawn at the same time, set up memory
-        that later ones reuse (40 ms and 10 MB). A hash grid needs next to nothing.
+        The first picture of each thread, and the first pictures drawn at the same time, set up
+        memory that later ones reuse (40 ms and 10 MB). A hash grid needs next to nothing.
         """
         with self._lock:
             fields = [field for field in self._open.values() if field.metadata.kind == SPLATS]
