@@ -93,6 +93,8 @@ class AgentConfig:
     max_delay_ms: float | None = None
     """Longest time from capture to Ack; quality falls below --crf to keep it, and pictures are
     dropped when the lowest quality cannot. Without it every frame has --crf."""
+    fetch_share: float = 0.5
+    """Share of the link that fetching a field may take while pictures are sent, 0.05 to 1."""
     deadline_ms: float | None = None
     """Milliseconds a frame may take on this machine, from the picture to the packet: the best rung
     of the ladder that keeps it is used, a lower one under load, in place of the effort."""
@@ -139,5 +141,7 @@ class AgentConfig:
             raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
         if self.max_delay_ms is not None and not 10 <= self.max_delay_ms <= 60_000:
             raise InvalidInput("max_delay_ms", f"{self.max_delay_ms} ms is outside 10..60000 ms")
+        if not 0.05 <= self.fetch_share <= 1:
+            raise InvalidInput("fetch_share", f"{self.fetch_share} is outside 0.05..1")
         if self.deadline_ms is not None and not 1 <= self.deadline_ms <= 60_000:
             raise InvalidInput("deadline_ms", f"{self.deadline_ms} ms is outside 1..60000 ms")

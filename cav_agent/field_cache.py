@@ -21,7 +21,7 @@ import structlog
 from cav_agent.cameras import VehicleCamera, VehicleCameras, instant_numbers, recorded_cameras
 from cav_agent.config import AgentConfig
 from cav_agent.deadline import DeadlineController, DeadlineRungs, FixedRung, Rungs
-from cav_agent.field_fetch import Beginnings, fetch_field
+from cav_agent.field_fetch import Beginnings, FetchPace, fetch_field
 from cav_agent.frame_log import DriveObserver
 from cav_agent.handover import ServedTile
 from cav_agent.lights import TileLights
@@ -94,6 +94,9 @@ class FieldCache:
         self._prepared: OrderedDict[Tile, asyncio.Task[PreparedField]] = OrderedDict()
         self._fetching: dict[Tile, asyncio.Task[None]] = {}
         self._fetching_own: set[asyncio.Task[None]] = set()
+        self.pace = FetchPace(
+            config.fetch_share, lambda: any(map(_succeeded, self._prepared.values()))
+        )
 
     async def prepared(self, served: ServedTile) -> PreparedField:
         """Return the tile's field, ready to code against; raise ``RfedgeError`` if it cannot be.
@@ -228,7 +231,9 @@ class FieldCache:
                 server = self._servers[served.server]
                 channel = await server.require(config.limits.give_up_s or None)
                 try:
-                    await fetch_field(channel, store, field_id, folder, server.metadata, beginnings)
+                    await fetch_field(
+                        channel, store, field_id, folder, server.metadata, beginnings, self.pace
+                    )
                     size_bytes = (await asyncio.to_thread(store.path, field_id)).stat().st_size
                     self._observer.field_fetched(size_bytes)
                 except UnknownField:
@@ -321,6 +326,10 @@ class ArrivingField:
         self._lights = lights
         if self.field is not None and self.field is not lights.own:
             lights.take_own(self.field)
+
+
+def _succeeded(task: asyncio.Task[PreparedField]) -> bool:
+    return task.done() and not task.cancelled() and task.exception() is None
 
 
 def _without_ground(tile: Tile) -> Tile:

@@ -5,12 +5,18 @@ before the archive is parsed. An archive that begins with its lowest level of de
 (``rfcore.field.splat_archive``) is of use before it is whole: a beginning of it is parsed, each
 array checked against its own digest. The server draws the same from the whole; a beginning of
 another field shows at the latest when the server compares a render.
+
+While pictures are sent a field comes chunk by chunk, with rests (``FetchPace``): answers to frames
+come the same way, and wait behind it.
 """
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
+import math
+import time
+from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +48,79 @@ MAX_REFUSALS = 60
 """Tries of a transfer that broke, and of one that the server is too busy for: about a minute."""
 
 RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL, grpc.StatusCode.CANCELLED)
+
+
+IN_FLIGHT_BYTES = 64 * 1024
+"""HTTP/2's window: so much of a field is under way beyond what was asked for."""
+
+WAITED_S = 0.001
+"""A chunk that took longer was not there before it was asked for."""
+
+SLOWER_S = 0.02
+"""A chunk that takes longer after a rest, in which a window of them can come, shows that the link
+has become slower."""
+
+ROUND_TRIP_S = 0.1
+"""Longest time in which what was asked for begins to come."""
+
+MEASURE_AGAIN_S = 5.0
+"""A link's rate is measured again so often, by chunks without rests between them."""
+
+
+class FetchPace:
+    """Spaces the chunks of fields so that they take ``share`` of the link while pictures are sent.
+
+    ``is_sending`` says whether they are. Otherwise chunks follow each other at the link's rate,
+    and that is measured: over ``IN_FLIGHT_BYTES`` in chunks that all had to be waited for.
+    No clock is read: ``now`` is an argument.
+    """
+
+    def __init__(self, share: float, is_sending: Callable[[], bool]) -> None:
+        self._share = share
+        self._is_sending = is_sending
+        self._bytes_per_s: float | None = None
+        self._measured_s = 0.0
+        self._run: tuple[float, int] | None = None
+        """Start and bytes of a measurement: since when chunks come that are all waited for."""
+        self._has_rested = False
+        self._due_s = 0.0
+        self._chunks: deque[tuple[float, int]] = deque(maxlen=64)
+
+    def received(self, size_bytes: int, waited_s: float, now: float) -> float:
+        """Note a chunk that was waited for; return when the next may be asked for."""
+        self._chunks.append((now, size_bytes))
+        self._measure(size_bytes, waited_s, now)
+        rate = self._bytes_per_s
+        if rate is None or not self._is_sending():
+            self._due_s = now
+            return now
+        self._due_s = max(self._due_s, now) + size_bytes / (self._share * rate)
+        if self._due_s <= now or now - self._measured_s >= MEASURE_AGAIN_S:
+            return now
+        self._run, self._has_rested = None, True
+        return self._due_s
+
+    def _measure(self, size_bytes: int, waited_s: float, now: float) -> None:
+        is_waited, has_rested = waited_s > WAITED_S, self._has_rested
+        self._has_rested = False
+        if waited_s > SLOWER_S and has_rested:
+            self._measured_s = -math.inf
+        if not is_waited or self._run is None:
+            self._run = (now, 0) if is_waited else None
+            return
+        since_s, run_bytes = self._run
+        self._run = since_s, run_bytes + size_bytes
+        if self._run[1] >= IN_FLIGHT_BYTES:
+            self._bytes_per_s = self._run[1] / (now - since_s)
+            self._measured_s, self._run = now, (now, 0)
+
+    def wait_s(self, since_s: float, until_s: float) -> float:
+        """Return how long an answer between two times can have waited behind chunks."""
+        came = (size for at_s, size in self._chunks if since_s - ROUND_TRIP_S <= at_s <= until_s)
+        size_bytes = sum(came)
+        if not size_bytes or self._bytes_per_s is None:
+            return until_s - since_s if size_bytes else 0.0
+        return min(size_bytes, 2 * IN_FLIGHT_BYTES) / self._bytes_per_s
 
 
 class Beginnings:
@@ -89,6 +168,7 @@ async def fetch_field(
     folder: Path,
     metadata: Metadata = (),
     beginnings: Beginnings | None = None,
+    pace: FetchPace | None = None,
 ) -> None:
     """Put field ``field_id`` of the server into ``store``; what arrived before is not sent again.
 
@@ -100,7 +180,8 @@ async def fetch_field(
     partial = folder / f".{field_id}.part"
     size_bytes = await _size(stub, field_id, metadata)
     log.info("fetching field", field=field_id, size_bytes=size_bytes)
-    await Transfer(stub, field_id, partial, size_bytes, metadata, beginnings).receive_all()
+    pace = pace or FetchPace(1.0, lambda: False)
+    await Transfer(stub, field_id, partial, size_bytes, metadata, beginnings, pace).receive_all()
     await asyncio.to_thread(_check_and_add, store, field_id, partial)
     log.info("field fetched", field=field_id)
 
@@ -130,6 +211,7 @@ class Transfer:
     size_bytes: int
     metadata: Metadata
     beginnings: Beginnings | None
+    pace: FetchPace
 
     async def receive_all(self) -> None:
         """Receive what is missing; resume where it broke, and try a busy server again."""
@@ -158,7 +240,13 @@ class Transfer:
         request = pb.FetchFieldRequest(field_id=self.field_id, offset_bytes=have_bytes)
         call = self.stub.FetchField(request, metadata=self.metadata, wait_for_ready=True)
         with self.partial.open("ab") as file:
-            async for response in call:
+            while True:
+                asked_s = time.monotonic()
+                response = await call.read()
+                if not isinstance(response, pb.FetchFieldResponse):  # grpc.aio.EOF
+                    break
+                now = time.monotonic()
+                due_s = self.pace.received(len(response.chunk), now - asked_s, now)
                 end_bytes = response.offset_bytes + len(response.chunk)
                 if response.offset_bytes != have_bytes or end_bytes > self.size_bytes:
                     raise FieldFormatError(
@@ -168,6 +256,7 @@ class Transfer:
                 await asyncio.to_thread(_append, file, response.chunk)
                 have_bytes = end_bytes
                 await self._use(have_bytes)
+                await asyncio.sleep(due_s - time.monotonic())
         if have_bytes != self.size_bytes:
             raise FieldFormatError(
                 f"field {self.field_id} ended after {have_bytes} of {self.size_bytes} bytes; try "

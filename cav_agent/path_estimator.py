@@ -13,12 +13,15 @@ that range are considered, and the smaller room counts:
 
 A packet in flight that is overdue raises the cost before its answer does. No clock is read:
 ``now_ns`` is an argument, from any clock that does not run backwards.
+
+An answer may wait on the way back behind bytes that the vehicle itself downloads. It still proves
+what was delivered within its whole round trip, but only the time beyond that wait counts as cost.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
 from rfcore.errors import InvalidInput
@@ -29,7 +32,7 @@ FIRST_NS_PER_BYTE = 8_000.0
 MIN_RTT_WINDOW_NS = 10_000_000_000
 """Routes and radio cells change; a shortest round trip older than 10 s is forgotten."""
 
-DELIVERY_SAMPLES = 8
+DELIVERY_SAMPLES = 32
 """Answers from which the rate is estimated: most of a second at 10 Hz."""
 
 MEAN_MEMORY = 0.7
@@ -49,27 +52,43 @@ class PacketInFlight:
 
 @dataclass(frozen=True)
 class DeliverySample:
-    """An answered packet; ``rtt_ns`` excludes the wait behind the packets before it."""
+    """An answered packet; ``rtt_ns`` excludes the wait behind the packets before it.
+
+    ``own_ns``: so much of it at most the answer waited behind the vehicle's own downloads.
+    """
 
     size_bytes: int
     rtt_ns: int
     at_ns: int
+    own_ns: int = 0
+
+    @property
+    def bytes_per_ns(self) -> float:
+        """The rate that the answer proves."""
+        return self.size_bytes / self.rtt_ns
+
+
+def _no_downloads(since_ns: int, until_ns: int) -> int:  # noqa: ARG001
+    return 0
 
 
 class PathEstimator:
     """Estimates from the packets ``sent``, ``answered`` and ``lost`` the ``room_bytes`` of others.
 
     Packets are answered in the order in which they were sent; ``key`` names one.
+    ``own_wait_ns`` returns how long an answer to what was sent at the first time, not there before
+    the second, can have waited behind the vehicle's own downloads.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, own_wait_ns: Callable[[int, int], int] = _no_downloads) -> None:
+        self._own_wait_ns = own_wait_ns
         self._in_flight: dict[Hashable, PacketInFlight] = {}
         self._samples: deque[DeliverySample] = deque(maxlen=DELIVERY_SAMPLES)
         self._shortest: deque[DeliverySample] = deque()
         """Samples of the window that none after them undercuts: the first has the minimum."""
         self._answered_ns: int | None = None
-        self._mean_bytes = 0.0
-        self._mean_rtt_ns = 0.0
+        self._means = (0.0, 0.0, 0.0)
+        """Running means of size, of its square, and of size times round trip."""
 
     @property
     def bytes_in_flight(self) -> int:
@@ -108,61 +127,83 @@ class PathEstimator:
         """Forget a packet: no answer will come, or one that says nothing of the path."""
         self._in_flight.pop(key, None)
 
-    def answered(self, key: Hashable, now_ns: int) -> None:
-        """Note that the answer to ``key`` came; unknown keys are ignored."""
+    def answered(self, key: Hashable, now_ns: int) -> DeliverySample | None:
+        """Note that the answer to ``key`` came, and return what it says; None: unknown key."""
         packet = self._in_flight.pop(key, None)
         if packet is None:
-            return
-        rtt_ns = max(1, now_ns - self._start_ns(packet, self._answered_ns))
+            return None
+        start_ns = self._start_ns(packet, self._answered_ns)
+        rtt_ns = max(1, now_ns - start_ns)
+        own_ns = min(rtt_ns, self._own_wait_ns(start_ns, now_ns))
         self._answered_ns = now_ns
-        self._add(DeliverySample(packet.size_bytes, rtt_ns, now_ns))
+        sample = DeliverySample(packet.size_bytes, rtt_ns, now_ns, own_ns)
+        self._add(sample)
+        return sample
 
-    def room_bytes(self, ready_ns: int, due_ns: int, now_ns: int) -> float:
+    def room_bytes(self, ready_ns: int, due_ns: int, now_ns: int, share: float = 1.0) -> float:
         """Return how large a packet sent at ``ready_ns`` may be to be answered by ``due_ns``.
 
-        0 or less when even an empty one would be late.
+        ``share``: the part that may be used of the time beyond the shortest round trip. 0 or less
+        when even an empty packet would be late.
         """
         cost, free_ns = self._outlook(now_ns)
-        spare_ns = due_ns - max(ready_ns, free_ns - self.min_rtt_ns)
+        spare_ns: float = due_ns - max(ready_ns, free_ns - self.min_rtt_ns)
+        spare_ns -= (1 - share) * max(0.0, spare_ns - self.min_rtt_ns)
         room = (spare_ns - self.min_rtt_ns) / cost if cost else float("inf")
-        if not self._samples:
-            return min(room, spare_ns / FIRST_NS_PER_BYTE)
-        proven = max(sample.size_bytes / sample.rtt_ns for sample in self._samples)
-        return min(room, spare_ns * proven)
+        return min(room, spare_ns * self._proven())
 
     def sustained_bytes(self, interval_ns: float, now_ns: int) -> float:
         """Return how large packets may be that go out every ``interval_ns`` for ever."""
         cost, _ = self._outlook(now_ns)
         return interval_ns / cost if cost else float("inf")
 
+    def _proven(self) -> float:
+        """Return the bytes per nanosecond that the last answers prove, or that are assumed."""
+        if not self._samples:
+            return 1 / FIRST_NS_PER_BYTE
+        return max(sample.bytes_per_ns for sample in self._samples)
+
     def _add(self, sample: DeliverySample) -> None:
         if self._outdates_others(sample):
             self._samples.clear()
-        self._samples.append(sample)
+        if not sample.own_ns or sample.bytes_per_ns > self._proven():
+            self._samples.append(sample)
+        if not sample.own_ns or sample.rtt_ns < self.min_rtt_ns:
+            self._add_shortest(sample)
+        size, keep = float(sample.size_bytes), MEAN_MEMORY if self._means[0] else 0.0
+        found = size, size**2, size * (sample.rtt_ns - sample.own_ns)
+        bytes_, squares, products = (
+            keep * mean + (1 - keep) * new for mean, new in zip(self._means, found, strict=True)
+        )
+        self._means = bytes_, squares, products
+
+    def _add_shortest(self, sample: DeliverySample) -> None:
         while self._shortest and self._shortest[-1].rtt_ns >= sample.rtt_ns:
             self._shortest.pop()
         self._shortest.append(sample)
         while self._shortest[0].at_ns < sample.at_ns - MIN_RTT_WINDOW_NS:
             self._shortest.popleft()
-        keep = MEAN_MEMORY if self._mean_bytes else 0.0
-        self._mean_bytes = keep * self._mean_bytes + (1 - keep) * sample.size_bytes
-        self._mean_rtt_ns = keep * self._mean_rtt_ns + (1 - keep) * sample.rtt_ns
 
     def _outdates_others(self, sample: DeliverySample) -> bool:
         """Return whether a packet no larger than an earlier one took twice its time or more."""
         return any(
-            other.size_bytes >= sample.size_bytes and 2 * other.rtt_ns <= sample.rtt_ns
+            other.size_bytes >= sample.size_bytes
+            and 2 * other.rtt_ns <= sample.rtt_ns - sample.own_ns
             for other in self._samples
         )
 
     def _cost(self) -> float:
-        """Return nanoseconds per byte beyond the shortest round trip."""
+        """Return nanoseconds per byte beyond the shortest round trip: the slope of the line of
+        least squares from there. Large packets tell it, small ones are as long for other reasons.
+        """
         if not self._samples:
             return FIRST_NS_PER_BYTE
-        cost = max(0.0, self._mean_rtt_ns - self.min_rtt_ns) / self._mean_bytes
+        mean_bytes, mean_square, mean_product = self._means
+        cost = max(0.0, mean_product - self.min_rtt_ns * mean_bytes) / mean_square
         newest = self._samples[-1]
-        if newest.size_bytes >= TELLING_SIZE * self._mean_bytes:
-            cost = max(cost, (newest.rtt_ns - self.min_rtt_ns) / newest.size_bytes)
+        if newest.size_bytes >= TELLING_SIZE * mean_square / mean_bytes:
+            beyond_ns = newest.rtt_ns - newest.own_ns - self.min_rtt_ns
+            cost = max(cost, beyond_ns / newest.size_bytes)
         return cost
 
     def _outlook(self, now_ns: int) -> tuple[float, int]:
@@ -171,9 +212,11 @@ class PathEstimator:
         for packet in self._in_flight.values():
             start_ns = self._start_ns(packet, free_ns)
             free_ns = start_ns + self.min_rtt_ns + round(cost * packet.size_bytes)
-            overdue_ns = now_ns - free_ns
+            overdue_ns = now_ns - free_ns - self._own_wait_ns(start_ns, now_ns)
             if overdue_ns > 0:
-                cost = max(cost, (now_ns - start_ns - self.min_rtt_ns) / packet.size_bytes)
+                cost = max(
+                    cost, (free_ns + overdue_ns - start_ns - self.min_rtt_ns) / packet.size_bytes
+                )
                 free_ns = now_ns + overdue_ns
         return cost, now_ns if free_ns is None else free_ns
 

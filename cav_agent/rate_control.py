@@ -11,6 +11,11 @@ The frames of a rig's instant count as one packet on the path: sent when the fir
 answered with the last, less the time for which none was on its way because the next was being
 coded. One frame of a camera among several is too short to tell the path's rate from its jitter.
 
+Only what fewer bytes can change is taken for the path's. An Ack says how long the server worked on
+the frame; that time is no part of the round trip. Answers may wait behind a field that the vehicle
+downloads (``own_wait_s``); that wait makes no frame late. Nor is a frame late for its bytes if an
+empty one would have been late too.
+
 ``BitDivision`` divides the bytes of an instant among the cameras of a rig, so that quality is even.
 A slice of complexity c takes about c 2^(-CRF / 6) bytes. So all cameras come out at one CRF when
 each gets bytes in proportion to its complexity, which is learnt from its coded frames. Motion, a
@@ -24,7 +29,8 @@ No clock is read: ``now`` is an argument.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from cav_agent.path_estimator import PathEstimator
@@ -47,9 +53,9 @@ LIMIT = 1.5
 """A slice of more than this many times its target is coded again."""
 
 SHRINK, GROW = 0.7, 0.004
-"""The share of the room that is used shrinks to 0.7 of itself when a frame was late (unless it was
-coded before the last cut), and grows by 0.004 for each in time. They balance at 1 late frame in
-100: 0.3 of any share up to 1 against 99 times 0.004."""
+"""The share of the time for bytes that is used shrinks to 0.7 of itself when a frame was late
+(unless it was coded before the last cut), and grows by 0.004 for each in time. They balance at 1
+late frame in 100: 0.3 of any share up to 1 against 99 times 0.004."""
 LEAST_SHARE = 0.1
 
 MEMORY = 0.75
@@ -60,6 +66,9 @@ LEAST_CAMERA_SHARE = 0.25
 
 HALVING_CRF = 6.0
 """CRF that halves a slice (4 of CRF change the bits of a street by 60 %)."""
+
+REMEMBERED_ANSWERS = 8
+"""Answers of which the longest work of the server counts before one is called overdue."""
 
 OVERHEAD_BYTES = 150
 """Pose, digests, gRPC and HTTP/2 framing around a slice: assumed until one was sent."""
@@ -98,16 +107,25 @@ class InstantInFlight:
 
 
 class RateControl:
-    """Keeps frames, or a rig's instants, within ``max_delay_s`` from capture to Ack."""
+    """Keeps frames, or a rig's instants, within ``max_delay_s`` from capture to Ack.
 
-    def __init__(self, max_delay_s: float) -> None:
+    ``own_wait_s`` returns how long an answer to what was sent at the first time, not there before
+    the second, can have waited behind the vehicle's own downloads.
+    """
+
+    def __init__(
+        self,
+        max_delay_s: float,
+        own_wait_s: Callable[[float, float], float] = lambda _since_s, _until_s: 0.0,
+    ) -> None:
         if not 0.01 <= max_delay_s <= 60:
             raise InvalidInput("max_delay", f"{1e3 * max_delay_s:g} ms is outside 10..60000 ms")
         self._max_delay_s = max_delay_s
-        self._path = PathEstimator()
+        self._path = PathEstimator(lambda a, b: _ns(own_wait_s(a / 1e9, b / 1e9)))
         self._share = 1.0
         self._cut_s = float("-inf")
-        self._work_s = 0.0
+        self._work_s = self._server_s = 0.0
+        self._server_times_s: deque[float] = deque([0.0], maxlen=REMEMBERED_ANSWERS)
         self._overhead_bytes = float(OVERHEAD_BYTES)
         self._interval_s: float | None = None
         self._captured_s: float | None = None
@@ -123,7 +141,7 @@ class RateControl:
 
     def is_late(self, captured_s: float, now: float) -> bool:
         """Return whether a picture has waited so long that even an empty frame would be late."""
-        least_s = self._work_s + self._path.min_rtt_ns / 1e9
+        least_s = self._work_s + self._server_s + self._path.min_rtt_ns / 1e9
         left_s = self._max_delay_s - least_s
         return now - captured_s > (left_s if left_s > 0 else self._max_delay_s)
 
@@ -132,25 +150,28 @@ class RateControl:
 
         ``pictures``: how many of one instant. None while they should wait for an answer.
         """
-        room = self._room_bytes(captured_s, now, 1.0, pictures)
+        room = self._room_bytes(captured_s, now, 1.0, 1.0, pictures)
         if self._path.bytes_in_flight and room < LEAST_BYTES * pictures:
             return None
-        room = self._share * self._room_bytes(captured_s, now, SHARE, pictures)
+        room = self._room_bytes(captured_s, now, SHARE, self._share, pictures)
         if self._interval_s:
             carried = self._path.sustained_bytes(1e9 * self._interval_s, _ns(now))
             room = min(room, SUSTAINED * carried - pictures * self._overhead_bytes)
         target = min(max(room, LEAST_BYTES * pictures), MOST_BYTES)
         return ByteBudget(target, int(LIMIT * target), self._path.rate_bps)
 
-    def _room_bytes(self, captured_s: float, now: float, share: float, pictures: int) -> float:
+    def _room_bytes(
+        self, captured_s: float, now: float, part: float, share: float, pictures: int
+    ) -> float:
         """Return the bytes that slices of an instant may have together to be answered in time.
 
-        In time is within ``share`` of the delay. Sending begins when the first is coded, and the
-        last has its part of the room.
+        In time is within ``part`` of the delay, using ``share`` of the room. Sending begins when
+        the first is coded, and the last has its part of the room.
         """
-        due_ns, now_ns = _ns(captured_s + share * self._max_delay_s), _ns(now)
+        due_ns = _ns(captured_s + part * self._max_delay_s - self._server_s)
+        now_ns = _ns(now - max(self._server_times_s))
         first, last = (
-            self._path.room_bytes(_ns(now + coded * self._work_s), due_ns, now_ns)
+            self._path.room_bytes(_ns(now + coded * self._work_s), due_ns, now_ns, share)
             for coded in (1, pictures)
         )
         return min(first, pictures * last) - pictures * self._overhead_bytes
@@ -189,15 +210,24 @@ class RateControl:
             frames.unsent -= 1
             self._close(instant, frames)
 
-    def answered(self, address: FrameAddress, latency_s: float, now: float) -> None:
-        """Note an answer, by Ack or Nack, ``latency_s`` after the frame's capture."""
+    def answered(
+        self, address: FrameAddress, latency_s: float, now: float, server_s: float | None = None
+    ) -> None:
+        """Note an answer, by Ack or Nack, ``latency_s`` after the frame's capture.
+
+        ``server_s``: how long the server worked on it, where the answer says so.
+        """
+        if server_s is None:
+            server_s = self._server_s
+        self._server_s = _mean(self._server_s or None, server_s)
+        self._server_times_s.append(server_s)
         key = self._instant_of.pop(address, None)
         if key is None:
-            self._adapt(latency_s, now)
+            self._adapt(latency_s, latency_s, now)
             return
         frames = self._instants[key]
         frames.unanswered.discard(address)
-        frames.answered_s = now
+        frames.answered_s = now - server_s
         frames.longest_latency_s = max(frames.longest_latency_s, latency_s)
         self._close(key, frames)
 
@@ -216,15 +246,23 @@ class RateControl:
         if not frames.is_over:
             return
         del self._instants[key]
-        if frames.answered_s is not None:
-            self._path.answered(key, _ns(frames.answered_s))
-            self._adapt(frames.longest_latency_s, frames.answered_s)
+        if frames.answered_s is None:
+            return
+        sample = self._path.answered(key, _ns(frames.answered_s))
+        latency_s = bytes_s = frames.longest_latency_s
+        if sample is not None:
+            latency_s -= sample.own_ns / 1e9
+            bytes_s = (sample.rtt_ns - sample.own_ns - self._path.min_rtt_ns) / 1e9
+        self._adapt(latency_s, bytes_s, frames.answered_s)
 
-    def _adapt(self, latency_s: float, now: float) -> None:
-        """Use less of the room when a frame, or the last of an instant, was late; else more."""
+    def _adapt(self, latency_s: float, bytes_s: float, now: float) -> None:
+        """Use less of the room when a frame, or the last of an instant, was late; else more.
+
+        One that was late without the ``bytes_s`` that its bytes took says nothing.
+        """
         if latency_s <= self._max_delay_s:
             self._share = min(1.0, self._share + GROW)
-        elif now - latency_s >= self._cut_s:
+        elif latency_s - bytes_s <= self._max_delay_s and now - latency_s >= self._cut_s:
             self._share = max(LEAST_SHARE, SHRINK * self._share)
             self._cut_s = now
 

@@ -409,7 +409,8 @@ class AgentSession:
         if self._rate_control is None:
             return
         if outcome in (Outcome.ACKED, Outcome.NACKED):
-            self._rate_control.answered(address, latency_s, now)
+            server_s = None if result.server is None else result.server.total_ns / 1e9
+            self._rate_control.answered(address, latency_s, now, server_s)
         else:
             self._rate_control.lost(address)
 

@@ -427,7 +427,9 @@ class StreamFactory:
         that overlap at a handover have different addresses."""
         first_epoch = max((session.epoch for session in self._sessions), default=-1) + 1
         delay_ms = self._config.max_delay_ms
-        rate_control = None if delay_ms is None else RateControl(delay_ms / 1e3)
+        rate_control = None
+        if delay_ms is not None:
+            rate_control = RateControl(delay_ms / 1e3, self._fields.pace.wait_s)
         cameras = prepared.pictures.cameras
         division = BitDivision({camera.camera_id: camera.priority for camera in cameras})
         session = AgentSession(

@@ -13,6 +13,7 @@ from lab.bench import Bench
 from lab.benchmark import EvalBenchmark
 from lab.city import PlanCity
 from lab.classes import EvalClasses
+from lab.cold_start import EvalColdStart
 from lab.intra_size import EvalIntraSize
 from lab.latency import EvalLatency
 from lab.live import EvalLive
@@ -33,6 +34,7 @@ Verb = (
     | Annotated[EvalBenchmark, subcommand("benchmark")]
     | Annotated[PlanCity, subcommand("city")]
     | Annotated[EvalClasses, subcommand("classes")]
+    | Annotated[EvalColdStart, subcommand("cold-start")]
     | Annotated[MakeFeed, subcommand("feed")]
     | Annotated[EvalIntraSize, subcommand("intra-size")]
     | Annotated[EvalLatency, subcommand("latency")]

@@ -199,6 +199,8 @@ $(OUT)/rig18/rig.toml: | $(OUT)
 	$(STREETGEN) build samples/street/vehicles.toml --split rig --rig all --size 300x168 --spp 9 --frames 0:72 --out $(@D)
 $(OUT)/live.json: | $(OUT)
 	$(LAB) live --cameras 1 4 8 --hz 1 --rounds 2 --work $(OUT)/live --out $@
+$(OUT)/cold-start.json: | $(OUT)
+	$(LAB) cold-start --work $(OUT)/cold-start --out $@
 $(OUT)/world.json: | $(OUT)
 	$(LAB) world --work $(OUT)/world --out $@
 BENCH := $(dir $(RFEDGE))python examples/bench_rfedge.py

@@ -31,8 +31,8 @@ from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1 import field_pb2_grpc
 from rfcore.wire.values import check_field_id
 
-CHUNK_BYTES = 64 * 1024
-"""Size of a chunk, the same as a connection's window: the memory that a peer which does not read
+CHUNK_BYTES = 16 * 1024
+"""Size of a chunk, a quarter of a connection's window: the memory that a peer which does not read
 costs."""
 
 MAX_OPEN_FIELDS = 8
