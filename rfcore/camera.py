@@ -62,6 +62,11 @@ class Intrinsics:
             if not math.isfinite(getattr(self, name)):
                 raise InvalidInput(f"intrinsics.{name}", f"{getattr(self, name)} must be finite")
 
+    def cropped(self, left_px: int, top_px: int, width_px: int, height_px: int) -> Intrinsics:
+        """Return the intrinsics of a part of the picture."""
+        cx_px, cy_px = self.cx_px - left_px, self.cy_px - top_px
+        return Intrinsics(width_px, height_px, self.fx_px, self.fy_px, cx_px, cy_px)
+
     def resized(self, width_px: int, height_px: int) -> Intrinsics:
         """Return the intrinsics of the same picture resampled to another size."""
         sx, sy = width_px / self.width_px, height_px / self.height_px

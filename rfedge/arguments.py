@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from rfcore.named_class import is_named_class
 from rfedge.samples import sample_path
 
 if TYPE_CHECKING:
+    from rfcore.dataset import Dataset
     from rfcore.field import RadianceField, SplatField
     from rfcore.wire.nats import NatsServers
     from rfcore.wire.tls import TlsFiles
@@ -95,6 +97,21 @@ def open_field(name: Path | str, *, threads: int = 1, isa: str | None = None) ->
         return own_field(str(name))
 
     return load_field(field_path(name), threads=threads, isa=isa, max_bytes=max_field_bytes())
+
+
+def open_drive(path: Path, field: RadianceField | None = None) -> Dataset:
+    """Read a dataset around a field's origin; say on stderr what was done to its pictures.
+
+    Lenses are undistorted as ``rfedge train --undistort`` does, so a field trained so can be seen
+    from its own pictures.
+    """
+    from rfcore.dataset import Distortion, read_dataset
+
+    origin = field.metadata.tile_origin if field is not None else None
+    dataset = read_dataset(path, tile_origin=origin, distortion=Distortion.UNDISTORT)
+    for change in dataset.changes:
+        print(f"{path}: {change}", file=sys.stderr)
+    return dataset
 
 
 def max_field_bytes() -> int:

@@ -151,10 +151,12 @@ def encode_drive(
     field: RadianceField,
     settings: CodingSettings,
     locate: Locate | None = None,
+    watch: Callable[[CodedFrame], None] = lambda _: None,
 ) -> CodedDrive:
     """Code every picture of a drive against the field's render at its pose.
 
-    ``locate`` finds the poses; without it they are the dataset's. Raises ``DatasetError`` if the
+    ``locate`` finds the poses; without it they are the dataset's. ``watch`` is called with each
+    frame once it is coded. Raises ``DatasetError`` if the
     pictures are not all of one camera, ``CodecError`` for a picture whose slice is too long for a
     message at every CRF.
 
@@ -181,6 +183,7 @@ def encode_drive(
     frames = []
     for picture, coded in zip(dataset.pictures, coded_frames, strict=True):
         _require_fit(picture.name, coded.encoded)
+        watch(coded)
         pose = None if coded.given.lost else coded.given.view.camera.world_from_cam
         frames.append(Frame(CAMERA_ID, picture.time_ns, pose, b"", coded.encoded.packet))
     camera = CameraDescription(CAMERA_ID, intrinsics, encoder.header)

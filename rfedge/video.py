@@ -7,28 +7,41 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
-import numpy as np
+from av.video.reformatter import ColorRange
 
+from rfcore.codec.h264.ffmpeg import SIGNAL, video_frame
 from rfcore.errors import InvalidInput
-from rfcore.image import Rgb
+from rfcore.image import I420, Rgb
+from rfcore.native.yuv import i420_from_rgb
+
+BT709 = 1
+"""The code of ITU-T H.273 for primaries, transfer and matrix."""
 
 
-def write_mp4(path: Path, frames: Iterable[Rgb], rate_hz: float) -> int:
+def write_mp4(path: Path, frames: Iterable[Rgb | I420], rate_hz: float) -> int:
     """Write pictures of one size and return how many; an odd last row or column is cut off.
 
-    CRF 16, so that what is seen is the pictures' quality. Raises ``InvalidInput`` for none.
+    Colours are BT.709 in limited range at every size, and the file says so: players take BT.601
+    for small pictures that do not. CRF 16, so that what is seen is the pictures' quality. Raises
+    ``InvalidInput`` for none.
     """
     count = 0
     with av.open(str(path), "w") as container:
         rate = Fraction(rate_hz).limit_denominator(1000)
-        stream = container.add_stream("libx264", rate=rate, options={"crf": "16", "preset": "fast"})
+        signal = ":".join(f"{name}={value}" for name, value in SIGNAL.items())
+        options = {"crf": "16", "preset": "fast", "x264-params": signal}
+        stream = container.add_stream("libx264", rate=rate, options=options)
         stream.pix_fmt = "yuv420p"
-        for rgb in frames:
-            height, width = (side - side % 2 for side in rgb.shape[:2])
+        codec = stream.codec_context
+        codec.color_range = ColorRange.MPEG
+        codec.colorspace = codec.color_primaries = codec.color_trc = BT709
+        for given in frames:
+            picture = given if isinstance(given, I420) else i420_from_rgb(given)
+            width, height = (side - side % 2 for side in picture.size_px)
             if not count:
                 stream.width, stream.height = width, height
-            even = np.ascontiguousarray(rgb[:height, :width])
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+            frame = video_frame(picture.cropped((width, height)), (width, height), count)
+            container.mux(stream.encode(frame))
             count += 1
         if count:
             container.mux(stream.encode(None))

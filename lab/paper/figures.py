@@ -13,6 +13,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from lab.paper.render_quality import BANDS
@@ -124,7 +125,8 @@ def _per_image(
         for (size, values), colour, marker in zip(curves.items(), LINES, MARKERS, strict=False):
             label = "{}x{}".format(*size)
             axes.plot(values, color=colour, marker=marker, markersize=3, linewidth=1.5, label=label)
-        axes.set(xlabel="image", ylabel="100 I / (I + P), %")
+        axes.set(xlabel="number of the picture", ylabel="100 I / (I + P), %")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.legend(frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
     lines = [["image", *("{}x{}".format(*size) for size in curves)]]
     for index, savings in enumerate(zip(*curves.values(), strict=True)):

@@ -77,7 +77,8 @@ class Decoders:
 
     ``kind`` is the kind in force, never AUTO once started. ``reachable``: whether packets may come
     from other machines, which decides what AUTO means; ``as_root``: whether root may decode in a
-    sandbox. ``count_loss`` is called for each decoder process that dies in use, on any thread;
+    sandbox. ``quiet``: do not log which kind was taken; ``problem`` says why a better one was not.
+    ``count_loss`` is called for each decoder process that dies in use, on any thread;
     ``start_failed`` with the reason why a spare process could not be started; ``limiter`` bounds
     the log lines about lost decoders; for ``waiting`` see ``DecoderPool``.
     """
@@ -88,6 +89,7 @@ class Decoders:
         *,
         reachable: bool = True,
         as_root: bool = False,
+        quiet: bool = False,
         count_loss: Callable[[LossCause], None] = lambda _: None,
         start_failed: Callable[[Exception], None] = lambda _: None,
         limiter: LogLimiter | None = None,
@@ -101,7 +103,9 @@ class Decoders:
                 reason="--decoder auto, and only this machine can reach the server",
                 remedy="--decoder bubblewrap or landlock, if programs here are not to be trusted",
             )
+        self.problem = ""
         self._as_root = as_root
+        self._quiet = quiet
         self._count_loss = count_loss
         self._start_failed = start_failed
         self._waiting = waiting
@@ -123,7 +127,12 @@ class Decoders:
             self._start_best()
         elif self.kind is not DecoderKind.IN_PROCESS:
             self._pool = self._pool_of(self.kind)
-        log.info("decoding", decoder=str(self.kind))
+        if not self._quiet:
+            if self.problem:
+                log.warning(
+                    "decoding in a lesser sandbox", decoder=str(self.kind), problem=self.problem
+                )
+            log.info("decoding", decoder=str(self.kind))
 
     def open(self, size_px: tuple[int, int]) -> PictureDecoder:
         """Return a decoder for pictures of ``size_px``."""
@@ -142,8 +151,7 @@ class Decoders:
             except RfedgeError as error:
                 problems.append(str(error))
                 continue
-            if problems:
-                log.warning("decoding in a lesser sandbox", decoder=str(kind), problem=problems[0])
+            self.problem = problems[0] if problems else ""
             return
         raise BackendUnavailable(
             f"no sandbox for decoders works here: {'; '.join(problems)}. To decode without one, "

@@ -5,14 +5,15 @@ The tile's origin is subtracted in float64. A lens is never dropped silently: wi
 
 Pictures are reduced by area averaging: each output pixel is the mean of the input rectangle it
 covers, so that nothing aliases. Its intrinsics are exactly ``Intrinsics.resized``, because pixel
-centres are at +0.5.
+centres are at +0.5. A size of another shape takes the middle of the pictures: nothing is squashed.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -38,6 +39,34 @@ def check_reduction(name: str, from_px: tuple[int, int], to_px: tuple[int, int])
             "size_px",
             f"{to_px[0]}x{to_px[1]} is outside 1x1..{from_px[0]}x{from_px[1]}, the size of {name}",
         )
+
+
+LEAST_KEPT = 0.5
+"""Share of a picture that a size of another shape must leave."""
+
+
+def middle_of_shape(
+    name: str, from_px: tuple[int, int], to_px: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of the largest middle part that has ``to_px``'s shape.
+
+    Raises ``InvalidInput`` where that is less than half of the picture.
+    """
+    (width, height), (to_width, to_height) = from_px, to_px
+    part = (
+        min(width, max(1, round(height * to_width / to_height))),
+        min(height, max(1, round(width * to_height / to_width))),
+    )
+    kept = part[0] * part[1] / (width * height)
+    if kept < LEAST_KEPT:
+        scale = max(to_px) / max(from_px)
+        raise InvalidInput(
+            "size",
+            f"{to_width}x{to_height} has another shape than {name}, {width}x{height} px, of which "
+            f"it leaves {kept:.0%}; {max(1, round(width * scale))}x{max(1, round(height * scale))} "
+            "has the same shape",
+        )
+    return (width - part[0]) // 2, (height - part[1]) // 2, *part
 
 
 def area_averaged(rgb: Rgb, width_px: int, height_px: int) -> Rgb:
@@ -81,7 +110,7 @@ class ReadOptions:
 
     ``tile_origin`` None stands for zero where the cameras are within 10 km of it, else for the
     median camera position rounded to whole metres. Pictures are reduced to ``size_px`` (width,
-    height) if it is given.
+    height) if it is given, their middle part if it has another shape.
     """
 
     tile_origin: TileOrigin | None = None
@@ -94,18 +123,18 @@ class Dataset:
     """Posed pictures on disk, in the order of the file.
 
     ``rate_hz`` is the mean rate of the pictures' times, ``None`` unless every picture has one and
-    they increase. ``points`` is ``None`` when the dataset has none. ``undistorted`` counts the
-    pictures that are resampled to take a lens out, ``sorted_out`` those that are listed but were
-    deleted as blurred (``rfcore.dataset.read``). ``exposure_varies`` is true where the
-    dataset says that every picture has an exposure of its own. ``anchor`` says where on the Earth
-    the tile's axes are, if the dataset does.
+    they increase. ``points`` is ``None`` when the dataset has none. ``changes`` says in a line each
+    what reading does to the pictures (undistorts or crops them). ``sorted_out`` counts those that
+    are listed but were deleted as blurred (``rfcore.dataset.read``). ``exposure_varies``
+    is true where the dataset says that every picture has an exposure of its own. ``anchor`` says
+    where on the Earth the tile's axes are, if the dataset does.
     """
 
     pictures: tuple[PosedPicture, ...]
     rate_hz: float | None
     points: PointCloud | None
     tile_origin: TileOrigin
-    undistorted: int = 0
+    changes: tuple[str, ...] = ()
     sorted_out: int = 0
     exposure_varies: bool = False
     anchor: Anchor | None = None
@@ -128,7 +157,7 @@ def assemble(source: Source, options: ReadOptions) -> Dataset:
         rate_hz=_rate_hz(times_ns) if timed else None,
         points=localised(source.points, origin) if source.points is not None else None,
         tile_origin=origin,
-        undistorted=sum(picture.camera.lens is not None for picture in source.pictures),
+        changes=tuple(_changes(source.pictures, options.size_px)),
         sorted_out=source.sorted_out,
         exposure_varies=source.exposure_varies,
         anchor=source.anchor.relative_to(origin) if source.anchor is not None else None,
@@ -141,7 +170,8 @@ def _posed(picture: SourcePicture, origin: TileOrigin, options: ReadOptions) -> 
     if options.size_px is not None:
         size_px = (intrinsics.width_px, intrinsics.height_px)
         check_reduction(picture.where, size_px, options.size_px)
-        intrinsics = intrinsics.resized(*options.size_px)
+        part = middle_of_shape(picture.where, size_px, options.size_px)
+        intrinsics = intrinsics.cropped(*part).resized(*options.size_px)
         read = partial(_read, picture, options.size_px)
     camera = Camera(intrinsics, _near(picture, origin))
     return PosedPicture(picture.name, camera, read, picture.time_ns or 0)
@@ -152,7 +182,30 @@ def _read(picture: SourcePicture, size_px: tuple[int, int] | None = None) -> Rgb
     lens = picture.camera.lens
     if lens is not None:
         rgb = undistorted(rgb, picture.camera.intrinsics, lens)
-    return rgb if size_px is None else area_averaged(rgb, *size_px)
+    if size_px is None:
+        return rgb
+    k = picture.camera.intrinsics
+    left, top, width, height = middle_of_shape(picture.where, (k.width_px, k.height_px), size_px)
+    return area_averaged(rgb[top : top + height, left : left + width], *size_px)
+
+
+def _changes(pictures: Sequence[SourcePicture], size_px: tuple[int, int] | None) -> Iterator[str]:
+    """Yield a line for pictures that are undistorted, and one for each shape that is cropped."""
+    bent = sum(picture.camera.lens is not None for picture in pictures)
+    if bent:
+        yield f"{bent} of {len(pictures)} pictures are undistorted"
+    if size_px is None:
+        return
+    cameras = [picture.camera.intrinsics for picture in pictures]
+    for from_px, count in Counter((k.width_px, k.height_px) for k in cameras).items():
+        _, _, *part = middle_of_shape("pictures", from_px, size_px)
+        if tuple(part) != from_px:
+            shapes = [f"{width}x{height}" for width, height in (from_px, part, size_px)]
+            yield (
+                f"{count} of {len(pictures)} pictures are cropped from {shapes[0]} to {shapes[1]} "
+                f"px, {part[0] * part[1] / (from_px[0] * from_px[1]):.0%} of them, which has the "
+                f"shape of {shapes[2]}"
+            )
 
 
 def _pinhole(picture: SourcePicture, distortion: Distortion) -> Intrinsics:
@@ -161,8 +214,8 @@ def _pinhole(picture: SourcePicture, distortion: Distortion) -> Intrinsics:
         return picture.camera.intrinsics
     if distortion is Distortion.REFUSE:
         raise DatasetError(
-            f"{picture.where}: lens distortion {lens}; train with --undistort, or write "
-            "undistorted pictures once with `rfedge dataset convert`"
+            f"{picture.where}: lens distortion {lens}; write undistorted pictures once with "
+            "`rfedge dataset convert`, or train with --undistort"
         )
     with blamed_on(picture.where):
         return pinhole_of(picture.camera.intrinsics, lens)

@@ -51,7 +51,14 @@ from rfcore.dataset.keys import (
     table_at,
 )
 from rfcore.dataset.kitti import OXTS, read_kitti_raw_source, read_kitti_source
-from rfcore.dataset.picture_file import check_size, find_picture, inside, picture_file, read_picture
+from rfcore.dataset.picture_file import (
+    SUFFIXES,
+    check_size,
+    find_picture,
+    inside,
+    picture_file,
+    read_picture,
+)
 from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
 from rfcore.dataset.recording import read_recording_source
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
@@ -235,6 +242,7 @@ def _inria_camera(where: str, keys: Table) -> SourceCamera:
 
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
+
 EXPECTED = (
     "transforms.json, sparse/0 of COLMAP, calib.txt or oxts of KITTI, cameras.json of INRIA, "
     "camera.toml, recording.jsonl of a server"
@@ -308,11 +316,24 @@ def _read_folder(folder: Path) -> Source:
     if recorded:
         return read_recorded_source(*recorded)
     if not found:
+        _refuse_pictures_alone(folder)
         raise DatasetError(f"{folder}: no dataset is recognised there (none of {EXPECTED})")
     if len(found) > 1:
         names = ", ".join(str(file) for file in found)
         raise DatasetError(f"{folder}: holds several datasets, name one of them: {names}")
     return read_source(found[0])
+
+
+def _refuse_pictures_alone(folder: Path) -> None:
+    """Raise ``DatasetError`` for a folder of pictures, saying how their poses are found."""
+    for place in (folder, folder / "images"):
+        files = place.iterdir() if place.is_dir() else ()
+        count = sum(file.suffix in SUFFIXES for file in files)
+        if count:
+            raise DatasetError(
+                f"{place}: holds {count} pictures and no poses; find those by structure from "
+                f"motion: rfedge dataset poses {shlex.quote(str(place))} --out DATASET"
+            )
 
 
 def _candidates(folder: Path) -> list[Path]:

@@ -74,6 +74,13 @@ class SplatField:
         self._rasterizers: dict[float, Rasterizer] = {}
         self._lock = Lock()
 
+    def __repr__(self) -> str:
+        splats = f"{self.primitives:,} splats of SH degree {self.gaussians.sh_degree}"
+        if self._archive is None:
+            return f"SplatField({splats}, of no file)"
+        size_mb = len(encode_archive(self._archive)) / 1e6
+        return f"SplatField({splats}, {size_mb:.2f} MB, id {self.field_id})"
+
     @cached_property
     def field_id(self) -> str:
         """SHA-256 of the field's archive, in hex."""

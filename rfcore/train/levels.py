@@ -27,6 +27,8 @@ from rfcore.train.schedule import view_order
 
 Progress = Callable[[int, int], None]
 """Called with the number of steps done and the number of all steps."""
+SecondsLeft = Callable[[], float]
+"""Returns the seconds that are left for the work."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +73,14 @@ def with_levels(
     progress: Progress | None = None,
     *,
     keep_order: bool = False,
+    left_s: SecondsLeft | None = None,
 ) -> SplatField:
     """Return the field with its splats in order of importance and its lower levels fitted.
 
-    ``keep_order``: leave the splats in the field's order. ``cameras``: those the field will be seen
-    from, such as the training views. The full level draws the same splats as before. Raises
-    ``InvalidInput`` when there is no camera.
+    ``keep_order``: leave the splats in the field's order. ``left_s``: with less time than
+    the iterations take, there are fewer, over which the rates fall as far. ``cameras``: those the
+    field will be seen from, such as the training views. The full level draws the same splats as
+    before. Raises ``InvalidInput`` when there is no camera.
     """
     settings = config if config is not None else LevelFitConfig()
     antialiased = field.metadata.antialiased
@@ -85,7 +89,9 @@ def with_levels(
         weights = contributions(ordered, cameras, threads=settings.threads, antialiased=antialiased)
         ordered = reordered(ordered, most_important_first(weights))
     wanted = len(ordered) and settings.iterations
-    levels = _fitted_levels(ordered, antialiased, cameras, settings, progress) if wanted else {}
+    levels = (
+        _fitted_levels(ordered, antialiased, cameras, settings, progress, left_s) if wanted else {}
+    )
     return SplatField(
         ordered, field.metadata, levels=levels, threads=settings.threads, isa=field.isa
     )
@@ -97,8 +103,11 @@ def fitted(
     cameras: Sequence[Camera],
     config: LevelFitConfig,
     progress: Progress | None = None,
+    timed_share: Callable[[], float] = lambda: 0.0,
 ) -> Gaussians:
     """Return ``start`` with scales and opacities that bring its pictures nearest to ``target``'s.
+
+    It ends when ``timed_share``, the share of its time that is over, is 1.
 
     ``target`` says whether splats are drawn antialiased. Every call sees the cameras in the same
     random order.
@@ -108,8 +117,11 @@ def fitted(
         start, threads=config.threads, isa=target.isa, antialiased=target.antialiased
     )
     for iteration in range(config.iterations):
+        share = max(iteration / config.iterations, timed_share())
+        if share >= 1:
+            break
         camera = cameras[next(order)]
-        rates = config.rates(iteration / config.iterations)
+        rates = config.rates(share)
         rasterizer.iterate(camera, target.render_colour(camera), rates)
         if progress is not None:
             progress(iteration + 1, config.iterations)
@@ -122,8 +134,9 @@ def _fitted_levels(
     cameras: Sequence[Camera],
     config: LevelFitConfig,
     progress: Progress | None,
+    left_s: SecondsLeft | None,
 ) -> LevelsOfDetail:
-    """Fit every level, each starting from the one above it."""
+    """Fit every level, each starting from the one above it; they share the time left."""
     full = Rasterizer(gaussians, threads=config.threads, antialiased=antialiased)
     above = gaussians
     levels: dict[float, LevelOfDetail] = {}
@@ -135,9 +148,18 @@ def _fitted_levels(
 
         kept = np.arange(kept_of(len(gaussians), detail))
         start = _widened(reordered(above, kept), config.widening)
-        above = fitted(start, full, cameras, config, moved)
+        timed_share = _timed_share(left_s, len(DETAILS[1:]) - number)
+        above = fitted(start, full, cameras, config, moved, timed_share)
         levels[detail] = LevelOfDetail(above.log_scales, above.opacity_logits)
     return levels
+
+
+def _timed_share(left_s: SecondsLeft | None, levels: int) -> Callable[[], float]:
+    """Return what says which share of one of ``levels`` equal parts of the time is over."""
+    if left_s is None:
+        return lambda: 0.0
+    begun_s = max(left_s(), 1e-9)
+    return lambda: (begun_s - left_s()) * levels / begun_s
 
 
 def _widened(gaussians: Gaussians, widening: float) -> Gaussians:

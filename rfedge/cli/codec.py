@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from rfcore.codec.h264.config import CoderSettings
-from rfedge.arguments import DATASET, FIELD, FOLDER, RENDERER, check_folder, open_field
+from rfcore.codec.h264.config import (
+    REFERENCE_FRAMES,
+    X264_REFERENCE_FRAMES,
+    Coder,
+    CoderSettings,
+    LightChange,
+)
+from rfedge.arguments import DATASET, FIELD, RENDERER, check_folder, open_drive, open_field
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
     from rfcore.dataset import Dataset
     from rfcore.field import RadianceField
-    from rfedge.offline import Locate
+    from rfcore.image import I420
+    from rfcore.views import PosedPicture
+    from rfcore.wire.drive_file import CodedDrive
+    from rfedge.offline import DecodedFrame, Locate
 
 RFV = arg(metavar="FILE.rfv")
+UNTIMED_HZ = 10.0
+"""Rate of a drive whose pictures have no times."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +50,8 @@ class Encode:
     """Picture of the camera's size that is white where --mask-qp applies."""
     mask_qp: int = -6
     """Change of H.264's QP inside the mask, -24..24; -6 halves the quantiser's step."""
+    against_x264: bool = False
+    """Also code the drive with x264 (low delay, our tools), and print the saving at equal PSNR."""
     localise: bool = False
     """Find the poses in the field, near the dataset's own; a frame without a pose is coded without
     the field."""
@@ -45,27 +61,59 @@ class Encode:
     """Render splats on the CPU or on an OpenCL device; the bytes are the same."""
 
     def run(self) -> None:
-        """Encode the drive and print its size."""
+        """Encode the drive; print its size, rate and quality, and how the field fits."""
         from rfcore.codec.h264.qp_map import MaskSettings
-        from rfcore.dataset import read_dataset
         from rfcore.raster.renderers import renderer_isa
         from rfcore.wire.drive_file import write_drive
-        from rfedge.offline import CodingSettings, encode_drive
+        from rfedge.offline import CodedFrame, CodingSettings, encode_drive
 
         isa = renderer_isa(self.renderer)
         field = open_field(self.field, threads=self.threads, isa=isa)
-        dataset = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
+        dataset = open_drive(self.drive, field)
+        self._check_place(field, dataset)
         k = dataset.pictures[0].camera.intrinsics
         qp_map = MaskSettings(self.mask, self.mask_qp).qp_map((k.width_px, k.height_px))
         coding = self.coding
         settings = CodingSettings(coding.name, self.crf, qp_map, coding.check_decode, coding.light)
-        coded = encode_drive(dataset, field, settings, self._located(field, dataset))
+        if coding.coder is Coder.X264:
+            taken = f"{X264_REFERENCE_FRAMES} of {REFERENCE_FRAMES}"
+            print(f"references: {taken} are used, x264 takes no more")
+        if coding.light is LightChange.OFF:
+            print("light: renders are used as they are (--light off)")
+        quality = _Quality(self.against_x264)
+
+        def watch(coded: CodedFrame) -> None:
+            quality.add(coded.given.frame, coded.encoded.reconstruction)
+
+        coded = encode_drive(dataset, field, settings, self._located(field, dataset), watch)
         write_drive(self.out, coded)
         payload_bytes = sum(len(frame.packet.payload) for frame in coded.frames)
+        size = self.out.stat().st_size
         print(
-            f"{self.out}: {len(coded.frames)} frames, {self.out.stat().st_size:,} bytes, "
+            f"{self.out}: {len(coded.frames)} frames, {size:,} bytes, "
             f"of which payload {payload_bytes:,}"
         )
+        rate_hz = dataset.rate_hz
+        rate = "no rate: the pictures have no times"
+        if rate_hz is not None:
+            kbps = 8 * size / len(coded.frames) * rate_hz / 1000
+            rate = f"{kbps:,.0f} kbit/s at {rate_hz:.4g} Hz"
+        print(f"  {rate}, luma PSNR {quality.psnr_db:.2f} dB")
+        if self.against_x264:
+            print(f"  {quality.against_x264(coded, self.crf, rate_hz or UNTIMED_HZ)}")
+
+    def _check_place(self, field: RadianceField, dataset: Dataset) -> None:
+        """Warn where the field shows something else than the drive's pictures."""
+        from rfedge.fields.check import FITS_DB, check_place
+
+        fit_db = check_place(field, dataset.pictures)
+        if fit_db < FITS_DB:
+            print(
+                f"warning: the field's renders have {fit_db:.1f} dB against the drive's pictures, "
+                f"a field of the place {FITS_DB:g} dB or more: is it of another place, frame or "
+                f"light? rfedge field check {self.field} --drive {self.drive}",
+                file=sys.stderr,
+            )
 
     def _located(self, field: RadianceField, dataset: Dataset) -> Locate | None:
         """Return the function that finds the poses, or None without --localise."""
@@ -76,16 +124,73 @@ class Encode:
         return LocatedDrive(field, dataset.pictures, own_poses(dataset.pictures)).locate
 
 
+class _Quality:
+    """The luma errors of decoded pictures, and the originals where ``keep`` says so."""
+
+    def __init__(self, keep: bool) -> None:
+        self._keep = keep
+        self._mse: list[float] = []
+        self._frames: list[I420] = []
+
+    def add(self, original: I420, decoded: I420) -> None:
+        """Take one picture; raise ``InvalidInput`` for two of different sizes."""
+        from rfcore.errors import InvalidInput
+        from rfedge.evaluate.clips import luma_mse
+
+        if original.size_px != decoded.size_px:
+            raise InvalidInput(
+                "originals",
+                "have {}x{} px, the coded pictures {}x{} px".format(
+                    *original.size_px, *decoded.size_px
+                ),
+            )
+        self._mse.append(luma_mse(decoded, original))
+        if self._keep:
+            self._frames.append(original)
+
+    @property
+    def psnr_db(self) -> float:
+        """PSNR of the mean squared error of all pictures."""
+        from rfedge.evaluate.clips import psnr_of_mse
+
+        return psnr_of_mse(sum(self._mse) / len(self._mse))
+
+    @property
+    def worst(self) -> tuple[float, int]:
+        """PSNR and index of the worst picture."""
+        from rfedge.evaluate.clips import psnr_of_mse
+
+        worst = max(range(len(self._mse)), key=self._mse.__getitem__)
+        return psnr_of_mse(self._mse[worst]), worst
+
+    def against_x264(self, coded: CodedDrive, crf: float, rate_hz: float) -> str:
+        """Return a line that compares with x264 at equal PSNR, without the first frame."""
+        import numpy as np
+
+        from rfcore.wire.convert import client_message_to_bytes
+        from rfedge.evaluate.clips import CodedClip
+        from rfedge.evaluate.rivals import percent_against_x264
+
+        sizes = np.array([len(client_message_to_bytes(frame)) for frame in coded.frames])
+        mse = np.array(self._mse)
+        ours = CodedClip(crf, sizes, mse, np.zeros_like(mse), cpu_ms=0.0)
+        percent = percent_against_x264(ours, self._frames, rate_hz)
+        fewer = f"{abs(percent):.0f} % {'fewer' if percent < 0 else 'more'} bits"
+        return f"{fewer} than x264-our-tools-medium at equal PSNR, without the first frame"
+
+
 @dataclass(frozen=True)
 class Decode:
-    """Decode a .rfv file to PNG files, with the field that it was encoded against."""
+    """Decode a .rfv file to PNG files or one MP4, with the field it was encoded against."""
 
     coded: Annotated[Path, Positional, RFV]
     """The coded drive."""
     field: Annotated[Path, FIELD]
     """The field: an archive (.rff), a name, or MODULE:CLASS (docs/how-to/python.md)."""
-    out: Annotated[Path, FOLDER]
-    """Folder for the PNG files."""
+    out: Annotated[Path, arg(metavar="FOLDER|FILE.mp4")]
+    """Folder for the PNG files, or a file ending in .mp4."""
+    originals: Annotated[Path | None, DATASET] = None
+    """The drive that was encoded, to print the PSNR of what is decoded."""
     decoder: Literal["auto", "bubblewrap", "landlock", "child", "in-process"] = "auto"
     """Sandbox of the H.264 decoder, as for mec-server; auto: the best one that works here."""
     threads: int = 2
@@ -97,19 +202,71 @@ class Decode:
         """Decode every frame; stop at the first packet that fails a check."""
         from mec_server.config import DecoderKind
         from mec_server.decoding.decoders import Decoders
-        from rfcore.image import write_png
-        from rfcore.native.yuv import rgb_from_i420
         from rfcore.raster.renderers import renderer_isa
         from rfcore.wire.drive_file import read_drive
         from rfedge.offline import decode_drive
 
-        check_folder(self.out, "a folder for PNG files")
+        film = self.out.suffix.lower() == ".mp4"
+        if not film:
+            check_folder(self.out, "a folder for PNG files, or a video ending in .mp4")
         drive = read_drive(self.coded)
         isa = renderer_isa(self.renderer)
         field = open_field(self.field, threads=self.threads, isa=isa)
-        self.out.mkdir(parents=True, exist_ok=True)
+        originals = self._originals(field, len(drive.frames))
         # A decoder of root becomes another user, and nothing but it runs on what the file says.
-        with Decoders(DecoderKind(self.decoder), as_root=True) as decoders:
-            for decoded in decode_drive(drive, field, decoders.open):
-                write_png(self.out / f"{decoded.sequence:06d}.png", rgb_from_i420(decoded.frame))
+        with Decoders(DecoderKind(self.decoder), as_root=True, quiet=True) as decoders:
+            if decoders.problem:
+                print(f"decoded in a {decoders.kind} sandbox: {decoders.problem}")
+            decoded = decode_drive(drive, field, decoders.open)
+            if film:
+                self._write_film(drive, self._compared(decoded, originals))
+            else:
+                self._write_pictures(drive, self._compared(decoded, originals))
+
+    def _originals(self, field: RadianceField, count: int) -> Sequence[PosedPicture]:
+        from rfcore.errors import InvalidInput
+
+        if self.originals is None:
+            return ()
+        pictures = open_drive(self.originals, field).pictures
+        if len(pictures) != count:
+            raise InvalidInput("originals", f"are {len(pictures)} pictures, {count} were encoded")
+        return pictures
+
+    def _compared(
+        self, decoded: Iterable[DecodedFrame], originals: Sequence[PosedPicture]
+    ) -> Iterator[DecodedFrame]:
+        """Pass frames through; print their PSNR after the last one."""
+        from rfcore.native.yuv import i420_from_rgb
+
+        quality = _Quality(keep=False)
+        for index, frame in enumerate(decoded):
+            if originals:
+                quality.add(i420_from_rgb(originals[index].read()), frame.frame)
+            yield frame
+        if originals:
+            worst_db, worst = quality.worst
+            print(
+                f"luma PSNR {quality.psnr_db:.2f} dB; the worst frame, "
+                f"{originals[worst].name}, {worst_db:.2f} dB"
+            )
+
+    def _write_pictures(self, drive: CodedDrive, decoded: Iterable[DecodedFrame]) -> None:
+        from rfcore.image import write_png
+        from rfcore.native.yuv import rgb_from_i420
+
+        self.out.mkdir(parents=True, exist_ok=True)
+        for frame in decoded:
+            write_png(self.out / f"{frame.sequence:06d}.png", rgb_from_i420(frame.frame))
         print(f"{self.out}: {len(drive.frames)} frames")
+
+    def _write_film(self, drive: CodedDrive, decoded: Iterable[DecodedFrame]) -> None:
+        """Write the MP4 at the mean rate of the frames' times."""
+        from rfedge.video import write_mp4
+
+        times_ns = [frame.capture_time_ns for frame in drive.frames]
+        taken_s = (times_ns[-1] - times_ns[0]) / 1e9
+        rate_hz = (len(times_ns) - 1) / taken_s if taken_s > 0 else UNTIMED_HZ
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        count = write_mp4(self.out, (frame.frame for frame in decoded), rate_hz)
+        print(f"{self.out}: {count} frames at {rate_hz:.4g} Hz")

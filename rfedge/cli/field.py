@@ -13,11 +13,14 @@ from rfedge.arguments import (
     FIELD,
     IMPORTED,
     RFF,
+    SIZE,
     SPLATS,
     field_path,
     max_field_bytes,
+    open_drive,
     open_field,
     open_splats,
+    parse_size,
 )
 from rfedge.cli.field_tiles import FieldList, FieldPublish, FieldRollback
 from rfedge.cli.field_update import FieldDisagree, FieldUpdate
@@ -118,7 +121,7 @@ class FieldImport:
             return read_splat_file(self.splats, origin, max_bytes)
         splats, stated, confinement = read_confined(self.splats, origin, max_bytes)
         if confinement is not BEST_FIRST[0]:
-            print(f"read in a lesser sandbox ({confinement}): {BEST_FIRST[0]} does not work here")
+            print(f"read in a {confinement} sandbox: {BEST_FIRST[0]} does not work here")
         return splats, stated
 
 
@@ -158,8 +161,8 @@ class FieldInfo:
 
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name."""
-    size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (1280, 720)
-    """Width and height of the frames measured, px (without --drive)."""
+    size: Annotated[str, SIZE] = "1280x720"
+    """Size of the frames measured, px (without --drive)."""
     drive: Annotated[Path | None, DATASET] = None
     """Posed pictures to measure every level of detail against, in dB and in ms."""
     threads: int = 2
@@ -169,7 +172,6 @@ class FieldInfo:
         """Load, describe, measure."""
         from rich.console import Console
 
-        from rfcore.dataset import read_dataset
         from rfcore.field import SplatField
         from rfedge.fields.describe import describe_field, frame_ms, print_levels
         from rfedge.fields.viewpoints import look_around
@@ -179,10 +181,9 @@ class FieldInfo:
         for name, value in describe_field(field):
             console.print(f"{name:>13}  {value}", highlight=False)
         pictures: tuple[PosedPicture, ...] = ()
-        cameras = look_around(field, *self.size)
+        cameras = look_around(field, *parse_size(self.size))
         if self.drive is not None:
-            origin = field.metadata.tile_origin
-            pictures = read_dataset(self.drive, tile_origin=origin).pictures
+            pictures = open_drive(self.drive, field).pictures
             cameras = [picture.camera for picture in pictures]
         if isinstance(field, SplatField):
             print_levels(console, field, cameras, pictures)
@@ -209,7 +210,6 @@ class FieldCheck:
 
     def run(self) -> None:
         """Check; a field that does not fit is an error."""
-        from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidData
         from rfcore.field import SplatField, save_field
         from rfcore.field.similarity import read_field_from_world
@@ -217,7 +217,7 @@ class FieldCheck:
 
         field = open_field(self.field, threads=self.threads)
         nerfstudio = read_field_from_world(self.transform) if self.transform else None
-        pictures = read_dataset(self.drive, tile_origin=field.metadata.tile_origin).pictures
+        pictures = open_drive(self.drive, field).pictures
         fit = check_field(field, pictures, nerfstudio)
         if isinstance(field, SplatField) and fit.mode is not None:
             field = drawn_antialiased(field, fit.mode.antialiased)
@@ -332,23 +332,18 @@ class FieldSlim:
     def _sized(self, field: SplatField, config: LevelFitConfig) -> SplatField:
         from rich.console import Console
 
-        from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfedge.training.finish import FieldSizer, size_goal
 
         if self.drive is None or self.raw:
             raise InvalidInput("max_mb", "and --passes go with --drive, and not with --raw")
-        origin = field.metadata.tile_origin
-        drive = read_dataset(self.drive, tile_origin=origin).pictures
+        drive = open_drive(self.drive, field).pictures
         sizer = FieldSizer(drive, drive, config, Console())
         return sizer.sized(field, size_goal(self.max_mb, self.passes))
 
 
 def _cameras_of(drive: Path, field: SplatField) -> list[Camera]:
-    from rfcore.dataset import read_dataset
-
-    pictures = read_dataset(drive, tile_origin=field.metadata.tile_origin).pictures
-    return [picture.camera for picture in pictures]
+    return [picture.camera for picture in open_drive(drive, field).pictures]
 
 
 def _check_out(out: Path, suffix: str) -> None:

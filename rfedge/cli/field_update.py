@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import FIELD, RFF, open_field
+from rfedge.arguments import FIELD, RFF, open_drive, open_field
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -164,11 +164,9 @@ class FieldDisagree:
 
 
 def _passes(recordings: tuple[Path, ...], base: RadianceField) -> list[Pass]:
-    from rfcore.dataset import read_dataset
     from rfcore.update.passes import Pass
 
-    origin = base.metadata.tile_origin
-    return [Pass(str(path), read_dataset(path, tile_origin=origin).pictures) for path in recordings]
+    return [Pass(str(path), open_drive(path, base).pictures) for path in recordings]
 
 
 def _learnt(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import DATASET, FIELD, field_path, open_field
+from rfedge.arguments import DATASET, FIELD, field_path, open_drive, open_field
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,7 +59,6 @@ class Localise:
         from rich.console import Console
         from rich.progress import track
 
-        from rfcore.dataset import read_dataset
         from rfedge.localisation.report import write_localise_report
         from rfedge.localisation.searches import (
             SearchSummary,
@@ -73,7 +72,7 @@ class Localise:
 
         error = parse_start_error(self.start_error)
         field = open_field(self.field, threads=self.threads)
-        pictures = read_dataset(self.drive, tile_origin=field.metadata.tile_origin).pictures
+        pictures = open_drive(self.drive, field).pictures
         count = len(pictures) if self.tries is None else self.tries
         shown, feed = Console(stderr=True), None
         if self.pose_feed is None:

@@ -8,7 +8,16 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import DATASET, FIELD, RENDERER, check_folder, open_field
+from rfedge.arguments import (
+    DATASET,
+    FIELD,
+    RENDERER,
+    SIZE,
+    check_folder,
+    open_drive,
+    open_field,
+    parse_size,
+)
 
 
 @dataclass(frozen=True)
@@ -24,11 +33,11 @@ class Render:
     drive: Annotated[Path | None, DATASET] = None
     """A dataset with the poses; its pictures are used only to print PSNR."""
     psnr: bool = False
-    """Print the PSNR of each render against the drive's picture, dB."""
+    """Print the PSNR of each render against the drive's picture, and the mean, dB."""
     frames: int = 96
     """Number of pictures of an orbit."""
-    size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (960, 540)
-    """Width and height of an orbit's pictures, px."""
+    size: Annotated[str, SIZE] = "960x540"
+    """Size of an orbit's pictures, px; those of a drive have the size of its camera."""
     up: Literal["z", "y", "-y"] = "z"
     """Axis of the field that points up (orbit)."""
     rate_hz: float = 24.0
@@ -46,12 +55,12 @@ class Render:
 
     def run(self) -> None:
         """Render the path."""
-        from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfcore.field import Quality
         from rfcore.raster.renderers import renderer_isa
         from rfedge.fields.viewpoints import (
             OrbitSettings,
+            compared,
             drive_viewpoints,
             orbit_viewpoints,
             pictures_along,
@@ -67,16 +76,24 @@ class Render:
             self.field, threads=self.threads, isa=renderer_isa(self.renderer, self.isa)
         )
         if self.path == "orbit" or (self.path is None and self.drive is None):
-            viewpoints = orbit_viewpoints(field, OrbitSettings(self.frames, *self.size, up=self.up))
+            viewpoints = orbit_viewpoints(
+                field, OrbitSettings(self.frames, *parse_size(self.size), up=self.up)
+            )
         elif self.drive is None:
             raise InvalidInput("drive", "--path drive needs --drive, a dataset with the poses")
         else:
-            origin = field.metadata.tile_origin
-            viewpoints = drive_viewpoints(read_dataset(self.drive, tile_origin=origin).pictures)
+            viewpoints = drive_viewpoints(open_drive(self.drive, field).pictures)
+        if self.psnr and viewpoints[0].seen is None:
+            raise InvalidInput("psnr", "compares with a drive's pictures; give --drive DATASET")
         pictures = pictures_along(field, viewpoints, quality)
+        psnr_db: list[float] = []
+        if self.psnr:
+            pictures = compared(pictures, psnr_db)
         if film:
             self.out.parent.mkdir(parents=True, exist_ok=True)
             count = write_mp4(self.out, (rgb for _, rgb in pictures), self.rate_hz)
             print(f"{self.out}: {count} pictures")
         else:
-            write_pictures(self.out, pictures, self.psnr)
+            write_pictures(self.out, pictures, psnr_db)
+        if psnr_db:
+            print(f"mean of {len(psnr_db)} pictures: {sum(psnr_db) / len(psnr_db):.2f} dB")

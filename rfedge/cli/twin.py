@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from rfedge.arguments import ADDRESS, DATASET, FOLDER, TwinConnection
+from rfedge.arguments import ADDRESS, DATASET, FOLDER, TwinConnection, open_drive
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,19 +83,14 @@ class Twin:
         return lambda scene: ServerSource(client, self.fields, scene, self.threads)
 
     def _field(self, target: str) -> Callable[[TwinScene], Source]:
-        from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfedge.twin.drive_source import DriveSource, FollowedFile
 
         if not 0 < self.rate_hz <= 120:
             raise InvalidInput("rate_hz", f"{self.rate_hz:g} is outside 0..120")
-        field: RadianceField | FollowedFile
-        if self.follow:
-            field, origin = FollowedFile(Path(target), self.threads), None
-        else:
-            field = self._open(target)
-            origin = field.metadata.tile_origin
-        drive = read_dataset(self.drive, tile_origin=origin).pictures if self.drive else ()
+        opened = None if self.follow else self._open(target)
+        field = opened or FollowedFile(Path(target), self.threads)
+        drive = open_drive(self.drive, opened).pictures if self.drive else ()
         name = Path(target).stem
         return lambda scene: DriveSource(name, field, drive, self.rate_hz, scene)
 

@@ -32,7 +32,7 @@ from rfcore.views import PosedPicture
 def convert_dataset(
     path: Path, out: Path, size_px: tuple[int, int] | None, chosen: slice = slice(None)
 ) -> str:
-    """Write ``out`` and return one line about it.
+    """Write ``out``; return a line about it, and one for each thing done to the pictures.
 
     Pictures are undistorted and reduced once; poses and points keep the dataset's own world.
     Raises ``InvalidInput`` when ``out`` exists, ``DatasetError`` naming what is wrong in ``path``.
@@ -46,8 +46,7 @@ def convert_dataset(
         raise InvalidInput("offset", f"leaves none of the {len(dataset.pictures)} pictures")
     with whole_folder(out) as folder:
         write_in_own_world(folder, dataset, enumerate(pictures), global_points(dataset))
-    lens = f", {dataset.undistorted} of the dataset's undistorted" if dataset.undistorted else ""
-    return f"{out}: {len(pictures)} pictures{lens}"
+    return "\n".join([f"{out}: {len(pictures)} pictures", *dataset.changes])
 
 
 def write_in_own_world(

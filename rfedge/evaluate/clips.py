@@ -20,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera
-from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
-from rfedge.arguments import open_field
+from rfedge.arguments import open_drive, open_field
 
 PEAK = 255.0
 STEADY = slice(1, None)
@@ -318,7 +317,7 @@ def read_drive(name: DriveName | str, limit: int | Runs | None = None) -> Drive:
     ``DriveName.parse`` does."""
     if isinstance(name, str):
         name = DriveName.parse(name)
-    pictures: Sequence[PosedPicture] = read_dataset(name.dataset).pictures
+    pictures: Sequence[PosedPicture] = open_drive(name.dataset).pictures
     length = len(pictures)
     part = None
     if isinstance(limit, Runs):

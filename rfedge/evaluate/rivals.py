@@ -7,6 +7,7 @@ frame at the start unless the rival is about key frames. Options are the librari
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -242,6 +243,33 @@ def x264_with_our_tools(preset: str) -> Rival:
 def _tuned(plain: Rival, metric: str) -> Rival:
     """Return an x264 of low delay tuned for a metric besides."""
     return replace(plain, options={**plain.options, "tune": f"zerolatency,{metric}"})
+
+
+def percent_against_x264(ours: CodedClip, frames: Sequence[I420], rate_hz: float) -> float:
+    """Return by how many percent ours needs more bytes than x264 with our tools at equal luma PSNR.
+
+    The first frame is left out. Between two CRFs, at most 1 apart, the logarithm of x264's bytes is
+    interpolated over decibels. Raises ``InvalidInput`` for a single frame, and where x264 has no
+    CRF of that quality.
+    """
+    if len(frames) < 2:
+        raise InvalidInput("against_x264", "needs two frames: the first is not compared")
+    rival, wanted_db = x264_with_our_tools("medium"), ours.psnr_db()
+    low, high = rival.limits
+    finer, coarser = (rival.code(frames, rate_hz, crf) for crf in (low, high))
+    if not coarser.psnr_db() <= wanted_db <= finer.psnr_db() or math.isinf(wanted_db):
+        raise InvalidInput(
+            "against_x264",
+            f"{wanted_db:.2f} dB are outside x264's {coarser.psnr_db():.2f}.."
+            f"{finer.psnr_db():.2f} dB; choose another --crf",
+        )
+    while coarser.point - finer.point > 1:
+        between = rival.code(frames, rate_hz, (coarser.point + finer.point) // 2)
+        finer, coarser = (between, coarser) if between.psnr_db() >= wanted_db else (finer, between)
+    qualities_db = coarser.psnr_db(), finer.psnr_db()
+    log_bytes = [math.log(clip.bytes_per_frame()) for clip in (coarser, finer)]
+    equal_bytes = math.exp(float(np.interp(wanted_db, qualities_db, log_bytes)))
+    return 100 * (ours.bytes_per_frame() / equal_bytes - 1)
 
 
 def x265_lowdelay(preset: str) -> Rival:

@@ -130,6 +130,34 @@ MAX_PAIR_WIDTH_PX = 640
 F32 = NDArray[np.float32]
 
 
+FAR = 10.0
+"""Distance of a camera from a field's middle, over that of half of the splats, from which on it is
+taken for a camera of another place: those of the sample stay below 4."""
+
+
+def check_place(field: RadianceField, pictures: Sequence[PosedPicture]) -> float:
+    """Return the PSNR in dB of renders against pictures, the mean of four.
+
+    Raises ``InvalidInput`` when all cameras are far away from the field.
+    """
+    eyes = np.array([picture.camera.world_from_cam.translation_m for picture in pictures])
+    low, high = np.array(field.bounds.low_m), np.array(field.bounds.high_m)
+    middle, reach_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    if isinstance(field, SplatField) and field.primitives:
+        means = field.gaussians.means.astype(np.float64)
+        middle = np.median(means, axis=0)
+        reach_m = float(np.median(np.linalg.norm(means - middle, axis=1)))
+    nearest_m = float(np.linalg.norm(eyes - middle, axis=1).min())
+    if nearest_m > FAR * reach_m:
+        raise InvalidInput(
+            "field",
+            f"is of another place than the drive: its nearest camera is {nearest_m:.4g} m from the "
+            f"field's middle, and half of the field lies within {reach_m:.4g} m; give the field of "
+            "this drive, or poses in its frame (rfedge field check)",
+        )
+    return _psnr_db(_FieldInDrive(field), _spread(pictures, PAIRS), AS_GIVEN)
+
+
 @dataclass(frozen=True)
 class ModeFit:
     """PSNR of a field's splats in either mode, under the convention that fits best."""

@@ -8,7 +8,7 @@ them lie within.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -135,14 +135,22 @@ def pictures_along(
         yield viewpoint, rgb_from_colour(field.render_colour(viewpoint.camera, quality))
 
 
+def compared(
+    pictures: Iterable[tuple[Viewpoint, Rgb]], psnr_db: list[float]
+) -> Iterator[tuple[Viewpoint, Rgb]]:
+    """Pass pictures through, and append the PSNR of each against what the camera saw there."""
+    for viewpoint, rgb in pictures:
+        if viewpoint.seen is not None:
+            psnr_db.append(psnr(rgb, viewpoint.seen.read()))
+        yield viewpoint, rgb
+
+
 def write_pictures(
-    folder: Path, pictures: Iterable[tuple[Viewpoint, Rgb]], with_psnr: bool
+    folder: Path, pictures: Iterable[tuple[Viewpoint, Rgb]], psnr_db: Sequence[float] = ()
 ) -> None:
-    """Write PNG files and print their names, with the PSNR where a camera saw something."""
+    """Write PNG files and print their names, with ``psnr_db`` if ``compared`` fills it."""
     folder.mkdir(parents=True, exist_ok=True)
     for viewpoint, rgb in pictures:
         path = folder / f"{viewpoint.name}.png"
         write_png(path, rgb)
-        seen = viewpoint.seen if with_psnr else None
-        note = f"  {psnr(rgb, seen.read()):.2f} dB" if seen is not None else ""
-        print(f"{path}{note}")
+        print(f"{path}  {psnr_db[-1]:.2f} dB" if psnr_db else path)

@@ -26,7 +26,6 @@ from rfcore.camera import Intrinsics, Pose
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.sender.encoder import DeltaEncoder
-from rfcore.dataset import read_dataset
 from rfcore.field import RadianceField
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT
@@ -42,6 +41,7 @@ from rfcore.wire.messages import (
     RendererContract,
     ServerMessage,
 )
+from rfedge.arguments import open_drive
 
 
 class End(StrEnum):
@@ -265,7 +265,7 @@ def prerecorded_drive(
     text = f"{RENDERER_CONTRACT} {field.field_id} {drive.resolve()} {effort} {crf}"
     folder = cache / hashlib.sha256(text.encode()).hexdigest()[:16]
     if not (folder / "alone.rfv").exists():
-        pictures = read_dataset(drive, tile_origin=field.metadata.tile_origin).pictures
+        pictures = open_drive(drive, field).pictures
         _coded(pictures, field, effort, crf).write(folder)
     return folder
 

@@ -49,7 +49,10 @@ RIVALS = {
 
 def read_sized_drive(name: DriveName, size_px: tuple[int, int] | None, limit: int | None) -> Drive:
     """Read at most ``limit`` frames, reduced to ``size_px`` (width, height) by averaging areas."""
-    pictures = read_dataset(name.dataset, size_px=size_px).pictures[:limit]
+    dataset = read_dataset(name.dataset, size_px=size_px)
+    for change in dataset.changes:
+        print(f"{name.dataset}: {change}")
+    pictures = dataset.pictures[:limit]
     return Drive(name, pictures, [i420_from_rgb(picture.read()) for picture in pictures])
 
 

@@ -33,6 +33,9 @@ TILE_CHECKPOINT_EVERY = 500
 """Iterations between checkpoints of a tile: the most that a killed worker loses."""
 DEFAULT_LIMIT = 250_000
 """Largest set of a run limited by time: about what two cores train in five minutes."""
+KEPT_SHARE, MOST_KEPT_S = 0.25, 120.0
+"""Share of --minutes that is kept for levels of detail, and the most: all their iterations take
+about 90 s on two cores."""
 HALVED_UNTIL = 0.25
 """Share of a run limited by time that trains on halved pictures (docs/how-to/training.md)."""
 
@@ -80,7 +83,9 @@ class Train:
     undistort: bool = False
     """Remove lens distortion from the pictures; otherwise distorted pictures are refused."""
     minutes: float | None = None
-    """Length of the training in minutes, instead of a number of iterations."""
+    """Length of the run in minutes from when the pictures are read, instead of a number of
+    iterations. A quarter of it, at most two minutes, is kept for levels of detail; choosing a size
+    (--max-mb, --passes) comes after it."""
     iterations: int | None = None
     """Training iterations, one picture each; default: the trainer's own."""
     gaussians: int | None = None
@@ -198,7 +203,7 @@ class Train:
         job = self.training_job()
         with self._shown(console) as show:
             trained = train(job, console, show)
-        field = self._finished(job, trained.field, console)
+        field = self._finished(job, trained, console)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, self.out)
         console.print(f"{self.out}: field {field_id}, {trained.primitives:,} primitives")
@@ -309,6 +314,7 @@ class Train:
         writes_checkpoints = self.resume or self.checkpoint_every > 0
         limits = LoopLimits(
             minutes=self.minutes,
+            kept_s=self._kept_s,
             checkpoint=self.out.with_suffix(".ckpt") if writes_checkpoints else None,
             checkpoint_every=self.checkpoint_every or 1000,
             measurements=12 if self.kind == "splats" else 4,  # rendering a hash grid takes seconds
@@ -324,6 +330,14 @@ class Train:
             resume=self.resume,
             align_held_out=self.refine_poses or self.align_held_out,
         )
+
+    @property
+    def _kept_s(self) -> float:
+        """The part of --minutes that levels of detail have."""
+        chooses_size = (self.max_mb, self.passes) != (None, None)
+        if self.minutes is None or self.plain or self.kind == "ngp" or chooses_size:
+            return 0.0
+        return min(KEPT_SHARE * 60 * self.minutes, MOST_KEPT_S)
 
     def _config(self, exposure_varies: bool) -> SplatTrainingConfig | NgpTrainingConfig:
         from rfcore.train.ngp import NgpTrainingConfig
@@ -348,18 +362,20 @@ class Train:
         return replace(config, exposure=exposure_varies, refine_poses=self.refine_poses)
 
     def _finished(
-        self, job: TrainingJob, trained: RadianceField, console: Console
+        self, job: TrainingJob, trained: Trained, console: Console
     ) -> RadianceField:
         from rfcore.field import SplatField
         from rfcore.train.levels import LevelFitConfig
         from rfedge.training.finish import finish_field, size_goal
 
-        if self.plain or not isinstance(trained, SplatField):
-            return trained
+        field = trained.field
+        if self.plain or not isinstance(field, SplatField):
+            return field
         goal = size_goal(self.max_mb, self.passes)
         held_out = job.held_out.pictures if job.held_out is not None else ()
         levels = LevelFitConfig(threads=self.threads)
-        return finish_field(trained, job.dataset.pictures, held_out, levels, console, goal)
+        left_s = trained.left_s if self._kept_s else None
+        return finish_field(field, job.dataset.pictures, held_out, levels, console, goal, left_s)
 
 
 def train_tile(tile: Train, tell: Tell) -> None:

@@ -30,7 +30,7 @@ from rfcore.field.quality import LevelsOfDetail
 from rfcore.field.splat_grid import FINEST, Grain, Steps
 from rfcore.field.store import encode_field
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train.levels import LevelFitConfig, fitted, with_levels
+from rfcore.train.levels import LevelFitConfig, SecondsLeft, fitted, with_levels
 from rfcore.train.trainer import held_out_quality
 from rfcore.update.passes import SeenFrame, spread
 from rfcore.update.run import Trial, saved_percent, try_field
@@ -40,6 +40,8 @@ MOST_CAMERAS = 60
 """Number of cameras, evenly spread, from which the visible directions of splats are taken."""
 TRIAL_FRAMES = 8
 """Consecutive frames that are coded against every size."""
+AFTER_LEVELS = 0.4
+"""Share of the time left of a run that compressing and measuring the field may take."""
 LEVELS_SHARE = 1.15
 """Upper bound of what fitted levels multiply a field's bytes by; 1.12 on the first sample."""
 
@@ -111,7 +113,9 @@ class FieldSizer:
         drive: Sequence[PosedPicture],
         config: LevelFitConfig,
         console: Console,
+        left_s: SecondsLeft | None = None,
     ) -> None:
+        self._left_s = left_s
         self._cameras = [view.camera for view in views]
         self._seen_from = [view.camera for view in spread(views, MOST_CAMERAS)]
         self._drive = drive
@@ -181,7 +185,7 @@ class FieldSizer:
         return _with_splats(field, fitted(kept, full, self._cameras, config) if fit else kept, {})
 
     def _with_levels(self, field: SplatField) -> SplatField:
-        return fit_levels(field, self._cameras, self._config, self._console)
+        return fit_levels(field, self._cameras, self._config, self._console, self._left_s)
 
     def _frugal(self, field: SplatField, size: FieldSize) -> SplatField:
         """Return the compressed field, with colours simplified in directions nobody sees."""
@@ -225,13 +229,15 @@ def finish_field(
     config: LevelFitConfig,
     console: Console,
     goal: SizeGoal | None = None,
+    left_s: SecondsLeft | None = None,
 ) -> SplatField:
     """Return the field with levels fitted to ``views``' cameras, compressed and measured.
 
-    ``goal`` says how large the field may be. Passes are like ``held_out``, or like ``views`` if
-    that is empty; then the header states no quality.
+    ``goal`` says how large the field may be. With ``left_s`` the fit of levels leaves time to
+    compress and to measure. Passes are like ``held_out``, or like ``views`` if that is empty; then
+    the header states no quality.
     """
-    sizer = FieldSizer(views, held_out or views, config, console)
+    sizer = FieldSizer(views, held_out or views, config, console, left_s)
     small = sizer.sized(field, goal if goal is not None else SizeGoal())
     if not held_out:
         return small
@@ -242,9 +248,14 @@ def finish_field(
 
 
 def fit_levels(
-    field: SplatField, cameras: list[Camera], config: LevelFitConfig, console: Console
+    field: SplatField,
+    cameras: list[Camera],
+    config: LevelFitConfig,
+    console: Console,
+    left_s: SecondsLeft | None = None,
 ) -> SplatField:
     """Return the field with lower levels of detail fitted to ``cameras``, showing progress."""
+    after_s = AFTER_LEVELS * left_s() if left_s is not None else 0.0
     columns = (
         TextColumn("levels of detail"),
         BarColumn(),
@@ -257,4 +268,5 @@ def fit_levels(
         def show(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        return with_levels(field, cameras, config, show)
+        fit_left_s = None if left_s is None else lambda: left_s() - after_s
+        return with_levels(field, cameras, config, show, left_s=fit_left_s)

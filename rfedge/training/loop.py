@@ -1,8 +1,9 @@
 """The loop around a trainer: time, measurements, checkpoints, progress on the console.
 
 The loop takes any ``FieldTrainer``. It counts seconds of training, without the time for measuring
-and for reading pictures; a resumed run goes on counting where it stopped. Progress is a bar on a
-terminal, and a line at each twentieth of the run in a log.
+and for reading pictures. A limit in minutes counts measuring, too, and what follows the training. A
+resumed run goes on counting where it stopped. Progress is a bar on a terminal, and a line at each
+twentieth of the run in a log.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ class LoopLimits:
     """When a run ends, and how often it writes a checkpoint and measures."""
 
     minutes: float | None = None
-    """End after so many minutes of training instead of at the trainer's iterations."""
+    """Length of the whole run, instead of the trainer's iterations."""
+    kept_s: float = 0.0
+    """The part of ``minutes`` that is kept for what follows the training."""
     checkpoint: Path | None = None
     checkpoint_every: int = 1000
     """Iterations between two checkpoints."""
@@ -41,6 +44,8 @@ class LoopLimits:
     def __post_init__(self) -> None:
         if self.minutes is not None and not 0 < self.minutes <= MAX_MINUTES:
             raise InvalidInput("minutes", f"{self.minutes} is outside 0..{MAX_MINUTES:.0f}")
+        if self.minutes is not None and not 0 <= self.kept_s < 60 * self.minutes:
+            raise InvalidInput("kept_s", f"{self.kept_s} is outside 0..{60 * self.minutes:g}")
         if self.checkpoint_every < 1:
             raise InvalidInput("checkpoint_every", f"{self.checkpoint_every} must be at least 1")
         if not 0 <= self.measurements <= 1000:
@@ -49,13 +54,15 @@ class LoopLimits:
 
 @dataclass(frozen=True)
 class LoopStatus:
-    """State of a run: ``progress`` 0..1, the last iteration's loss, the last measurement."""
+    """State of a run: ``progress`` 0..1 of the training, the last iteration's loss, the last
+    measurement, and the seconds left of a run of so many minutes."""
 
     progress: float
     iteration: int
     loss: float
     primitives: int
     psnr_db: float | None
+    left_s: float | None = None
 
 
 class TrainingLoop:
@@ -78,7 +85,7 @@ class TrainingLoop:
         self.curve: list[tuple[float, float]] = []
         """Seconds of training and held-out PSNR in dB."""
         self._limits, self._measure, self._clock = limits, measure, clock
-        self._before_s = self._aside_s = 0.0
+        self._before_s = self._aside_s = self._elapsed_before_s = 0.0
         self._started_s = clock()
 
     @property
@@ -87,11 +94,29 @@ class TrainingLoop:
         return self._before_s + self._clock() - self._started_s - self._aside_s
 
     @property
-    def progress(self) -> float:
-        """The share of the run that is done, 0..1."""
+    def left_s(self) -> float | None:
+        """Seconds of the whole run that are left; None for a run of a number of iterations."""
         if self._limits.minutes is None:
+            return None
+        return max(60 * self._limits.minutes - self._elapsed_s, 0.0)
+
+    @property
+    def _elapsed_s(self) -> float:
+        return self._elapsed_before_s + self._clock() - self._started_s
+
+    @property
+    def kept_share(self) -> float:
+        """The share of the whole run that is kept for what follows the training."""
+        minutes = self._limits.minutes
+        return 0.0 if minutes is None else self._limits.kept_s / (60 * minutes)
+
+    @property
+    def progress(self) -> float:
+        """The share of the training that is done, 0..1."""
+        minutes = self._limits.minutes
+        if minutes is None:
             return self.trainer.iteration / self.trainer.total
-        return min(self.seconds / (60 * self._limits.minutes), 1.0)
+        return min(self._elapsed_s / (60 * minutes - self._limits.kept_s), 1.0)
 
     def resume(self) -> None:
         """Go on after the checkpoint; raise ``InvalidInput`` if it belongs to another run."""
@@ -100,7 +125,7 @@ class TrainingLoop:
         checkpoint = read_checkpoint(self._limits.checkpoint)
         self.trainer.restore(checkpoint)
         loop = checkpoint.values["loop"]
-        self._before_s = float(loop["seconds"])
+        self._before_s, self._elapsed_before_s = float(loop["seconds"]), float(loop["elapsed_s"])
         self.curve = [(float(s), float(db)) for s, db in loop["curve"]]
         self._started_s, self._aside_s = self._clock(), 0.0
 
@@ -119,9 +144,15 @@ class TrainingLoop:
                 self._take_measurement(self._measure)
             if self._show is not None:
                 self._aside(partial(self._show, trainer))
-            psnr_db = self.curve[-1][1] if self.curve else None
             tell(
-                LoopStatus(self.progress, trainer.iteration, done.loss, trainer.primitives, psnr_db)
+                LoopStatus(
+                    progress=self.progress,
+                    iteration=trainer.iteration,
+                    loss=done.loss,
+                    primitives=trainer.primitives,
+                    psnr_db=self.curve[-1][1] if self.curve else None,
+                    left_s=self.left_s,
+                )
             )
 
     def _measurement_is_due(self) -> bool:
@@ -142,7 +173,7 @@ class TrainingLoop:
 
     def _save(self, path: Path) -> None:
         checkpoint = self.trainer.checkpoint()
-        loop = {"seconds": self.seconds, "curve": self.curve}
+        loop = {"seconds": self.seconds, "elapsed_s": self._elapsed_s, "curve": self.curve}
         write_checkpoint(replace(checkpoint, values={**checkpoint.values, "loop": loop}), path)
 
 
@@ -170,7 +201,8 @@ def _with_bar(loop: TrainingLoop, console: Console) -> None:
         task = bar.add_task("train", total=STEPS, state="")
 
         def tell(status: LoopStatus) -> None:
-            bar.update(task, completed=STEPS * status.progress, state=_state(status))
+            done = STEPS * status.progress * (1 - loop.kept_share)
+            bar.update(task, completed=done, state=_state(status))
 
         try:
             loop.run(tell)
@@ -180,7 +212,8 @@ def _with_bar(loop: TrainingLoop, console: Console) -> None:
 
 
 class _Lines:
-    """Prints a line at each twentieth; the time left follows from the pace since the start."""
+    """Prints a line at each twentieth; the time left is that of the minutes asked for, or follows
+    from the pace since the start."""
 
     def __init__(self, console: Console, now_s: Callable[[], float]) -> None:
         self._console, self._now_s = console, now_s
@@ -196,8 +229,9 @@ class _Lines:
         self._printed = int(LINES * status.progress)
         start_s, start_progress = self._start
         pace_s = (now_s - start_s) / max(status.progress - start_progress, 1e-9)
-        left = time_text(pace_s * (1.0 - status.progress))
-        self._console.print(f"  {status.progress:.0%}: {_state(status)}, {left} left")
+        left_s = pace_s * (1.0 - status.progress) if status.left_s is None else status.left_s
+        done = f"{status.progress:.0%}: {_state(status)}, {time_text(left_s)} left"
+        self._console.print(f"  {done}", soft_wrap=True)
 
 
 def _state(status: LoopStatus) -> str:

@@ -12,6 +12,7 @@ reported, and fields are compared with both aligned.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -36,6 +37,7 @@ from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.train.start import random_points
 from rfcore.train.trainer import FieldTrainer, HeldOut, held_out_quality, mean_psnr_db
 from rfcore.views import PosedPicture
+from rfedge.arguments import time_text
 from rfedge.results import make_result, provenance
 from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing
 
@@ -194,6 +196,12 @@ class Trained:
     refinement: PoseRefinement | None = None
     aligned: HeldOut | None = None
     """``quality`` at poses of the held-out pictures that were aligned with the field."""
+    ends_s: float = math.inf
+    """When the minutes of the run are over, on the monotonic clock."""
+
+    def left_s(self) -> float:
+        """Return the seconds that are left of the minutes of the run."""
+        return self.ends_s - monotonic()
 
 
 def training_config(
@@ -251,6 +259,7 @@ def train(
         iterations=trainer.iteration,
         primitives=trainer.primitives,
         curve=tuple(loop.curve),
+        ends_s=math.inf if loop.left_s is None else monotonic() + loop.left_s,
     )
 
 
@@ -288,11 +297,16 @@ def _announce(job: TrainingJob, console: Console) -> None:
     length = f"{config.iterations:,} iterations"
     if job.limits.minutes is not None:
         length = f"{job.limits.minutes:g} minutes"
+        if job.limits.kept_s:
+            length += f", the last {time_text(job.limits.kept_s)} for levels of detail"
     console.print(
         f"[bold]Training[/] {what} on {len(pictures)} pictures, {length}; about "
         f"{needed / 2**30:.1f} GiB of memory"
     )
+    for change in job.dataset.changes:
+        console.print(f"  {change}", highlight=False)
     check_memory(needed, available_bytes())
+    console.print("  reading the pictures")
 
 
 def _announce_end(seconds: float, quality: HeldOut | None, console: Console) -> None:

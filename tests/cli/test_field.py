@@ -127,7 +127,7 @@ def test_a_tile_origin_is_taken_off_and_kept(here, splats):
 
 def test_info_says_what_is_known_and_what_a_frame_takes(here, splats, drive, capsys):
     save_field(SplatField(splats), here / "a.rff")
-    FieldInfo(here / "a.rff", size=(64, 48)).run()
+    FieldInfo(here / "a.rff", size="64x48").run()
     said = capsys.readouterr().out
     for expected in ("splats", "not measured", "imported", "64x48", "100 %", "10 %", "raw"):
         assert expected in said
@@ -178,7 +178,7 @@ def test_levels_are_fitted_to_a_drives_cameras(here, splats, drive):
 
 def test_a_field_is_looked_at_around_and_along_a_drive(here, splats, drive, capsys):
     save_field(SplatField(splats), here / "a.rff")
-    Render(here / "a.rff", here / "orbit", frames=3, size=(32, 24), up="-y").run()
+    Render(here / "a.rff", here / "orbit", frames=3, size="32x24", up="-y").run()
     assert sorted(p.name for p in (here / "orbit").iterdir()) == [
         "00000.png",
         "00001.png",
@@ -203,7 +203,7 @@ def test_a_field_is_looked_at_around_and_along_a_drive(here, splats, drive, caps
         (FieldInfo(Path("nowhere")), InvalidInput, "'nowhere' is no field.*out/fields/nowhere.rff"),
         (Encode(Path("drive"), Path("no"), Path("o.rfv")), InvalidInput, "'no' is no field"),
         (Render(Path("a.rff"), Path("o.gif")), InvalidInput, r"no \.gif file .*\.mp4"),
-        (Decode(Path("a.rfv"), Path("a.rff"), Path("o.MP4")), InvalidInput, "a folder for PNG"),
+        (Decode(Path("a.rfv"), Path("a.rff"), Path("o.avi")), InvalidInput, "a folder for PNG"),
         (FieldSlim(Path("a.rff"), Path("b.rff"), 9999), InvalidInput, r"outside 1\.\.200"),
         (Render(Path("a.rff"), Path("o"), path="drive"), InvalidInput, "needs --drive"),
         (Render(Path("a.rff"), Path("o"), frames=0), InvalidInput, "frames"),

@@ -110,6 +110,19 @@ def test_no_more_references_than_allowed(max_references):
     assert chosen[-1] in (Reference.RENDER, Reference.CORRECTION)
 
 
+@pytest.mark.parametrize(("effort", "most"), [("default", 4), ("x264-ultrafast", 3)])
+def test_a_coder_is_given_no_more_references_than_it_takes(effort, most):
+    """x264 refuses a picture with four; the scene is that of ``half_known``."""
+    frame, view = pair(*SIZE_PX)
+    before = I420(*(plane.copy() for plane in frame.planes))
+    before.y[:, :160] = noise(*SIZE_PX).y[:, :160]
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort))
+    first = encoder.encode(encoder.start(1), before, wall(view.render))
+    choice = FrameChoice(max_references=4)
+    second = encoder.encode(first.state, frame, wall(view.render), choice)
+    assert len(second.packet.references) == most
+
+
 @pytest.mark.parametrize("size_px", [(1, 1), (7, 40), (40, 7)])
 def test_pictures_smaller_than_a_block_have_the_render(size_px):
     frame = picture(*size_px)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.dataset.assemble import area_averaged, check_reduction
+from rfcore.dataset.assemble import area_averaged, check_reduction, middle_of_shape
 from rfcore.errors import InvalidInput
 
 
@@ -47,3 +47,25 @@ def test_only_a_reduction_is_taken(size_px):
     check_reduction("a.png", (10, 8), (10, 8))
     with pytest.raises(InvalidInput, match=r"a\.png"):
         check_reduction("a.png", (10, 8), size_px)
+
+
+@pytest.mark.parametrize(
+    ("from_px", "to_px", "part"),
+    [
+        ((1080, 1920), (360, 640), (0, 0, 1080, 1920)),
+        ((640, 480), (320, 180), (0, 60, 640, 360)),
+        ((1242, 375), (400, 200), (246, 0, 750, 375)),
+        ((5, 3), (4, 2), (0, 0, 5, 3)),
+    ],
+)
+def test_another_shape_takes_the_largest_middle_part(from_px, to_px, part):
+    """Sides are whole pixels: the shape is met to half a pixel."""
+    left, top, width, height = middle_of_shape("a.png", from_px, to_px)
+    if part != (0, 0, 5, 3):
+        assert (left, top, width, height) == part
+    assert abs(width - height * to_px[0] / to_px[1]) <= max(0.5, 0.5 * to_px[0] / to_px[1])
+
+
+def test_a_shape_that_leaves_less_than_half_is_refused_with_one_that_fits():
+    with pytest.raises(InvalidInput, match=r"640x360.*a\.png, 1080x1920 px.*32%; 360x640 has"):
+        middle_of_shape("a.png", (1080, 1920), (640, 360))

@@ -203,15 +203,28 @@ def test_a_lens_is_taken_out_only_when_that_is_chosen(write, content):
         read_dataset(file)
     dataset = read_dataset(file, distortion="undistort")
     plain, lens = (picture.camera.intrinsics for picture in dataset.pictures)
-    assert dataset.undistorted == 1
+    assert dataset.changes == ("1 of 2 pictures are undistorted",)
     assert plain.fx_px == 10.0
     assert lens.fx_px > 10.0, "the corners reach outside the picture at the same focal length"
     assert (dataset.pictures[1].read() == 20).all()
 
 
-def test_a_smaller_size_scales_pictures_and_cameras_alike(write, content):
-    picture = read_dataset(write(content), size_px=(4, 2)).pictures[0]
+def test_a_size_of_another_shape_crops_and_points_stay_where_they_are(write, content):
+    """A square pixel stays square: nothing is squashed."""
+    dataset = read_dataset(write(content), size_px=(4, 2))
+    (picture, *_), whole = dataset.pictures, read_dataset(write(content)).pictures[0]
     assert picture.read().shape == (2, 4, 3)
+    u, v, _ = whole.camera.project((1, 1, -4))
+    assert picture.camera.project((1, 1, -4))[:2] == pytest.approx((u / 2, (v - 1) / 2))
+    k, own = picture.camera.intrinsics, whole.camera.intrinsics
+    assert k.fx_px / k.fy_px == own.fx_px / own.fy_px
+    (said,) = dataset.changes
+    assert "2 of 2 pictures are cropped from 8x6 to 8x4 px, 67%" in said
+
+
+def test_a_smaller_size_scales_pictures_and_cameras_alike(write, content):
+    picture = read_dataset(write(content), size_px=(4, 3)).pictures[0]
+    assert picture.read().shape == (3, 4, 3)
     assert picture.camera.project((1, 1, -4)) == pytest.approx((3.25, 0, 4))
     with pytest.raises(InvalidInput, match=r"8x6, the size of .*a\.png"):
         read_dataset(write(content), size_px=(16, 12))

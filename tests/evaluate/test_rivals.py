@@ -1,5 +1,7 @@
 """The rivals are real encoders: what they send is decoded, and nothing is held back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,9 +10,11 @@ from rfcore.image import I420
 from rfedge.evaluate.compare.drives import rival_families, ssim_rivals
 from rfedge.evaluate.rivals import (
     Rival,
+    percent_against_x264,
     svtav1_lowdelay,
     x264_for_psnr,
     x264_lowdelay,
+    x264_with_our_tools,
     x265_for_psnr,
     x265_lowdelay,
 )
@@ -189,3 +193,21 @@ def test_another_option_is_another_version():
 def test_an_encoder_that_refuses_its_options_is_named():
     with pytest.raises(CodecError, match="nobody"):
         Rival("nobody", "libx264", "h264", {"preset": "nosuch"}).code(panning_clip(1), 10, 23.0)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_x264_itself_needs_what_x264_needs(share):
+    """A stream of x264's own at CRF 30.5, and the same with half of its bytes."""
+    frames = panning_clip()
+    own = x264_with_our_tools("medium").code(frames, 10.0, 30.5)
+    ours = replace(own, frame_bytes=(share * own.frame_bytes).round().astype(int))
+    percent = percent_against_x264(ours, frames, 10.0)
+    assert percent == pytest.approx(100 * share - 100, abs=3)
+
+
+def test_a_quality_that_x264_does_not_reach_is_refused():
+    frames = panning_clip()
+    coded = x264_with_our_tools("medium").code(frames, 10.0, 30.0)
+    exact = replace(coded, luma_mse=np.zeros(len(frames)))
+    with pytest.raises(InvalidInput, match=r"inf dB are outside .* choose another --crf"):
+        percent_against_x264(exact, frames, 10.0)

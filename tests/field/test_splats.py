@@ -50,6 +50,14 @@ def test_an_unmeasured_field_says_so(tmp_path):
     assert load_field(tmp_path / "a.rff").metadata.held_out_psnr_db is None
 
 
+def test_a_field_of_a_file_is_shown_with_count_size_and_id(tmp_path):
+    field = SplatField(make_gaussians(7, 1))
+    assert "7 splats of SH degree 1, of no file" in repr(field)
+    save_field(field, tmp_path / "a.rff")
+    shown = repr(load_field(tmp_path / "a.rff"))
+    assert f"{(tmp_path / 'a.rff').stat().st_size / 1e6:.2f} MB, id {field.field_id}" in shown
+
+
 def test_any_difference_gives_another_id():
     gaussians = make_gaussians()
     ids = {

@@ -1,6 +1,7 @@
 """New pictures are placed in a dataset's own world, which stays as it is."""
 
 import math
+import shlex
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from rfcore.dataset.source import SourcePicture
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import write_png
+from rfedge.cli import parse
 from rfedge.datasets.colmap_features import PoseSettings, cancellable
 from rfedge.datasets.poses import pose_dataset
 
@@ -112,6 +114,21 @@ def test_a_drive_alone_finds_how_the_camera_turns(drive, tmp_path):
     assert np.median([turn_deg(ours, theirs) for ours, theirs in steps]) < 0.05
     ratios = [math.hypot(*o.translation_m) / math.hypot(*t.translation_m) for o, t in steps]
     assert max(ratios) / min(ratios) < 1.05
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_command_that_a_folder_without_poses_is_given_makes_a_dataset(drive, tmp_path):
+    pictures = tmp_path / "my pictures"
+    pictures.mkdir()
+    for i, picture in enumerate(drive):
+        write_png(pictures / f"{i}.png", picture.read())
+    with pytest.raises(DatasetError, match="holds 8 pictures and no poses") as refused:
+        read_dataset(pictures)
+    command = shlex.split(str(refused.value).partition(": rfedge ")[2])
+    assert command[-2:] == ["--out", "DATASET"]
+    parse([*command[:-1], str(tmp_path / "posed"), "--threads", "1"]).run()
+    assert len(read_dataset(tmp_path / "posed", distortion="undistort").pictures) >= 6
 
 
 def relative(a: SourcePicture, b: SourcePicture) -> Pose:

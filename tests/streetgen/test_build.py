@@ -218,7 +218,7 @@ def test_a_lens_is_written_with_its_pictures(tmp_path):
     content = json.loads((tmp_path / "s" / "transforms.json").read_text())
     assert content["k1"] == -0.1
     dataset = read_dataset(tmp_path / "s", distortion="undistort")
-    assert dataset.undistorted == 1
+    assert dataset.changes == ("1 of 1 pictures are undistorted",)
     classes = cv2.imread(str(tmp_path / "s/drive/classes/000000.png"), cv2.IMREAD_UNCHANGED)
     depth_m = read_depth_m(tmp_path / "s" / "drive" / "depth" / "000000.png")
     assert ((classes == 0) == np.isinf(depth_m)).all()

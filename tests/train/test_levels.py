@@ -59,6 +59,20 @@ def test_the_same_field_and_cameras_give_the_same_levels(field):
     assert len(ids) == 1
 
 
+def test_levels_share_the_time_that_is_left_and_end_with_it(field):
+    """Twelve seconds for three levels, and each look at the clock takes half a second."""
+    left, steps = iter(np.arange(12.0, -12.0, -0.5)), []
+    config = LevelFitConfig(iterations=60)
+    timed = with_levels(
+        field, CAMERAS, config, lambda done, _: steps.append(done), left_s=lambda: next(left)
+    )
+    of_level = [sum(low < step <= low + 60 for step in steps) for low in (0, 60, 120)]
+    assert all(5 <= count <= 8 for count in of_level)
+    plain = with_levels(field, CAMERAS, LevelFitConfig(iterations=0))
+    for detail in DETAILS[1:]:
+        assert error(timed, field, detail) < error(plain, field, detail)
+
+
 def test_an_empty_field_has_empty_levels():
     nothing = Gaussians(*(np.zeros((0, *s), "f4") for s in ((3,), (4,), (3,), (), (1, 3))))
     empty = with_levels(SplatField(nothing), CAMERAS)

@@ -127,6 +127,23 @@ def test_a_run_may_be_limited_by_time(wall, tmp_path):
     assert load_field(tmp_path / "a.rff").metadata.held_out_psnr_db is not None
 
 
+@pytest.mark.parametrize(
+    ("minutes", "changes", "kept_s"),
+    [
+        (2.0, {}, 30.0),
+        (60.0, {}, 120.0),
+        (2.0, {"plain": True}, 0.0),
+        (2.0, {"max_mb": 3.0}, 0.0),
+        (None, {}, 0.0),
+    ],
+)
+def test_a_part_of_the_minutes_is_kept_for_levels_of_detail(
+    wall, tmp_path, minutes, changes, kept_s
+):
+    settings = {"minutes": minutes, "plain": False, **changes}
+    assert verb(wall, tmp_path / "a.rff", **settings).training_job().limits.kept_s == kept_s
+
+
 def test_only_a_run_short_of_time_begins_with_halved_pictures(wall, tmp_path):
     by_time, by_count = (
         verb(wall, tmp_path / "a.rff", minutes=minutes).training_job().config

@@ -79,11 +79,20 @@ def test_a_run_limited_by_time_ends_by_the_clock_and_tells_the_trainer_how_far_i
 
 
 def test_measuring_takes_no_training_time():
-    steps = Steps(1_000_000)
-    loop = loop_of(steps, LoopLimits(minutes=1.0, measurements=5), measuring_s=500.0)
+    loop = loop_of(Steps(30), LoopLimits(measurements=5), measuring_s=500.0)
     statuses(loop)
-    assert steps.iteration == 30
+    assert loop.seconds == pytest.approx(60.0)
     assert [s for s, _ in loop.curve] == pytest.approx([12, 24, 36, 48, 60])
+
+
+def test_minutes_are_those_of_the_whole_run():
+    """Measuring takes 5 s twice, and 20 s are kept for the last one and what follows."""
+    steps = Steps(1_000_000)
+    limits = LoopLimits(minutes=2.0, measurements=2, kept_s=20.0)
+    loop = loop_of(steps, limits, measuring_s=5.0)
+    told = statuses(loop)
+    assert loop.seconds == pytest.approx(95.0, abs=2.0)
+    assert (told[0].left_s, told[-1].left_s) == pytest.approx((118.0, 15.0), abs=2.0)
 
 
 def test_the_curve_has_so_many_points_and_ends_at_the_end():
@@ -118,6 +127,17 @@ def test_a_resumed_run_goes_on_counting_seconds_and_its_curve(checkpoint_path):
     statuses(resumed)
     assert resumed.seconds == pytest.approx(24.0)
     assert [s for s, _ in resumed.curve] == pytest.approx([6.0, 12.0, 18.0, 24.0])
+
+
+def test_a_resumed_run_of_minutes_goes_on_counting_them(checkpoint_path):
+    limits = LoopLimits(1.0, checkpoint=checkpoint_path, checkpoint_every=10, measurements=0)
+    with pytest.raises(TrainingDiverged):
+        statuses(loop_of(Steps(1_000_000, fails_at=11), limits))
+    resumed = loop_of(Steps(1_000_000), limits)
+    resumed.resume()
+    assert resumed.left_s == pytest.approx(40.0)
+    statuses(resumed)
+    assert resumed.trainer.iteration == 30
 
 
 def test_the_last_good_checkpoint_survives_a_run_that_diverges(checkpoint_path):

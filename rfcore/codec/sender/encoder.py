@@ -76,7 +76,7 @@ class FrameChoice:
     """Send no slice: the receiver shows the only reference."""
     max_references: int = DEFAULT_REFERENCES
     """Most references that the encoder may choose. With the usual three, it may choose one more
-    under the light of the frame before."""
+    under the light of the frame before. A stream of x264 never has more than three."""
     block_means: bool = False
     """Send the render's block means, by which a receiver whose renderer is not exact tells rounding
     from a wrong pose."""
@@ -266,7 +266,8 @@ class DeltaEncoder:
         prediction = self._under_light(state, view, choice, costs, crf)
         references = choice.references
         if references is None:
-            references = choose_references(costs, prediction, crf, choice.max_references)
+            most = self._config.reference_frames
+            references = choose_references(costs, prediction, crf, choice.max_references, most)
         return _Plan(prediction, references, prediction.pictures(references))
 
     def _under_light(

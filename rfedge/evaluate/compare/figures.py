@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,8 @@ SHOWN = {
     "x265-lowdelay": ("#0f766e", "^"),
     "svtav1-lowdelay": ("#d97706", "v"),
 }
-"""Families in the plot, ours first, each with its setting that needs the fewest bytes; the CSV has
-all of them."""
+"""Families in the plot, ours first, each with its setting that needs the fewest bytes; codecs of
+``--method`` join them, and the CSV has all."""
 RIVALS = {
     "x264-our-tools-veryfast": ("#9aa5b1", "s"),
     HEADLINE_ANCHOR: ("#1c2733", "o"),
@@ -54,6 +55,8 @@ CODECS = {
     "x265-lowdelay-psnr": "#0f766e",
     "svtav1-lowdelay": "#d97706",
 }
+OTHERS = ("#6d28d9", "#4d7c0f")
+"""Colours of codecs of ``--method``."""
 OTHER = "#9aa5b1"
 """Colours of the frontier's codecs, by what their settings begin with."""
 LOW_DB, MIDDLE_DB, HIGH_DB = 29.0, 33.5, 38.0
@@ -100,7 +103,12 @@ def _curves(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
             lines.append([curve.setting, *values])
     with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
         figure, axes = plt.subplots(figsize=(7.2, 3.6))
-        for family, (colour, marker) in SHOWN.items():
+        others = [each.family for each in curves if _is_other(each.family, each.setting)]
+        shown = {**SHOWN, **_styles_of(others)}
+        if all(each.family != HEADLINE_ANCHOR for each in curves):
+            anchors = [c.family for c in curves if c.family.startswith("x264-our-tools")]
+            shown |= dict.fromkeys(anchors[:1], SHOWN[HEADLINE_ANCHOR])
+        for family, (colour, marker) in shown.items():
             those = [curve for curve in curves if curve.family == family]
             if those:
                 _draw(
@@ -151,6 +159,16 @@ def _codec(setting: str) -> str:
     return next((codec for codec in CODECS if setting.startswith(codec)), setting)
 
 
+def _is_other(family: str, setting: str) -> bool:
+    """Return whether a codec is none of ours and of the usual rivals: one of ``--method``."""
+    return family not in {**SHOWN, **RIVALS} and _codec(setting) not in CODECS
+
+
+def _styles_of(families: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Return a colour and a marker for each family of ``--method``."""
+    return dict(zip(dict.fromkeys(families), product(OTHERS, "P*<>hp"), strict=False))
+
+
 def _name_point(axes: Any, at: tuple[float, float], curve: CurveRow, *, above: bool) -> None:
     """Write a setting's name without its codec's, which the colour tells."""
     offset = (0, 5) if above else (0, -11)
@@ -199,7 +217,8 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
     drives = list(dict.fromkeys((row.scene, row.hz) for row in ours))
     with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
         figure, axes = plt.subplots(figsize=(7.2, 0.3 * len(drives) + 1.2))
-        for rival, (colour, marker) in RIVALS.items():
+        others = [row.rival for row in ours if _is_other(row.rival, row.rival_setting)]
+        for rival, (colour, marker) in {**RIVALS, **_styles_of(others)}.items():
             those = [row for row in ours if row.rival == rival]
             if not those:
                 continue
@@ -213,7 +232,10 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
         axes.tick_params("y", labelsize=8)
         axes.invert_yaxis()
         axes.set_xlabel("BD-rate of ours against the rival, %")
-        axes.set_xlim(right=5 + max(0.0, *(row.bd_rate_percent for row in ours)))
+        axes.set_xlim(
+            min(min(row.bd_rate_percent, row.ci95[0]) for row in ours) - 5,
+            max(0.0, *(row.bd_rate_percent for row in ours)) + 5,
+        )
         if axes.lines:
             axes.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1), fontsize=8)
     return figure, lines
