@@ -227,7 +227,7 @@ def _near(picture: SourcePicture, origin: TileOrigin) -> Pose:
     if distance_m > MAX_TILE_RADIUS_M:
         raise DatasetError(
             f"{picture.where}: camera is {distance_m:.6g} m from the tile's origin, over "
-            f"{MAX_TILE_RADIUS_M:g} m; pass a tile_origin near the pictures"
+            f"{MAX_TILE_RADIUS_M:g} m: the pictures are of another place than the field or tile"
         )
     return local
 

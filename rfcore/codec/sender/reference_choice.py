@@ -72,7 +72,6 @@ def choose_references(
     """
     if prediction.learns_light and max_references == DEFAULT_REFERENCES:
         max_references += 1
-    max_references = min(max_references, most)
     if min(costs.frame.size_px) < BLOCK_PX:
         return RENDER_ONLY
     at_crf = RateDistortion.at(crf)
@@ -88,7 +87,7 @@ def choose_references(
     beside = [Reference.PREVIOUS, *helpful] if has_past else []
     if has_past and max_references > DEFAULT_REFERENCES:
         beside.append(Reference.WARP)
-    return (*_in_order(beside[: max_references - 1]), best)
+    return (*_in_order(beside[: min(max_references, most) - 1]), best)
 
 
 def _usable(
