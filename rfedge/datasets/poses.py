@@ -16,9 +16,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rfcore.camera import Pose, TileOrigin
-from rfcore.dataset.assemble import chosen_origin
+from rfcore.dataset.assemble import Distortion, chosen_origin
 from rfcore.dataset.picture_file import SUFFIXES
-from rfcore.dataset.read import read_source, refuse_video
+from rfcore.dataset.read import read_dataset, read_source, refuse_video
 from rfcore.dataset.source import SourceCamera, SourcePicture, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError
@@ -55,8 +55,8 @@ def pose_dataset(
 ) -> str:
     """Write ``out`` with the pictures that could be placed; return one line about it.
 
-    ``tell`` is called with what is being done. Raises ``DatasetError`` when nothing can be
-    placed, ``InvalidInput`` when ``out`` exists.
+    ``tell`` is called with what is being done. Raises ``DatasetError`` when nothing can be placed
+    or the lens found is none, ``InvalidInput`` when ``out`` exists.
     """
     paths = _pictures(images, 1 if register_to is not None else MIN_PICTURES)
     known = read_source(register_to).pictures if register_to is not None else ()
@@ -68,7 +68,21 @@ def pose_dataset(
         names = [f"new/{path.name}" for path in paths]
         solution = solve_poses(root, names, known, settings, tell)
         _write(folder, root, names, solution)
+        if register_to is None:
+            _check_lens(images, folder, f"{len(solution.placed)} of {len(paths)}")
     return _summary(out, solution)
+
+
+def _check_lens(images: Path, folder: Path, placed: str) -> None:
+    """Raise ``DatasetError`` where the lens that was found makes no pinhole picture."""
+    try:
+        read_dataset(folder, distortion=Distortion.UNDISTORT)
+    except DatasetError as error:
+        raise DatasetError(
+            f"{images}: COLMAP placed {placed} pictures, with a lens that no camera has "
+            f"({str(error).rpartition('): ')[2]}); take more pictures that overlap, the camera "
+            "turned to the side, or give it: --camera-model PINHOLE --parameters FX FY CX CY"
+        ) from error
 
 
 def _pictures(images: Path, at_least: int) -> Sequence[Path]:

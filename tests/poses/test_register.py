@@ -13,16 +13,20 @@ import numpy as np
 import pycolmap
 import pytest
 
-from rfcore.camera import Pose
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.dataset import read_dataset
 from rfcore.dataset.read import read_source
-from rfcore.dataset.source import SourcePicture
+from rfcore.dataset.source import SourceCamera, SourcePicture, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError, InvalidInput
-from rfcore.image import write_png
+from rfcore.field import load_field
+from rfcore.image import rgb_from_colour, write_png
+from rfcore.lens import BrownLens
 from rfedge.cli import parse
+from rfedge.datasets import poses
 from rfedge.datasets.colmap_features import PoseSettings, cancellable
-from rfedge.datasets.poses import pose_dataset
+from rfedge.datasets.poses import PlacedPictures, pose_dataset
+from rfedge.fields.viewpoints import looking_at
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 SETTINGS = PoseSettings(max_side_px=640, features=1024, threads=1)
@@ -118,17 +122,38 @@ def test_a_drive_alone_finds_how_the_camera_turns(drive, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.sample
-def test_the_command_that_a_folder_without_poses_is_given_makes_a_dataset(drive, tmp_path):
+def test_the_command_that_a_folder_without_poses_is_given_makes_a_dataset(tmp_path):
+    """The pictures are the field's: a walk along the street, the camera turned to the side."""
     pictures = tmp_path / "my pictures"
     pictures.mkdir()
-    for i, picture in enumerate(drive):
-        write_png(pictures / f"{i}.png", picture.read())
+    field = load_field(SAMPLE.parent / "fields" / "street.rff")
+    for i in range(8):
+        eye = np.array([-20.0 + 0.6 * i, -1.5, 2.0])
+        pose = looking_at(eye, eye + np.array([0.2, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+        camera = Camera(Intrinsics(480, 360, 330.0, 330.0, 240.0, 180.0), pose)
+        write_png(pictures / f"{i}.png", rgb_from_colour(field.render_colour(camera)))
     with pytest.raises(DatasetError, match="holds 8 pictures and no poses") as refused:
         read_dataset(pictures)
     command = shlex.split(str(refused.value).partition(": rfedge ")[2])
     assert command[-2:] == ["--out", "DATASET"]
     parse([*command[:-1], str(tmp_path / "posed"), "--threads", "1"]).run()
     assert len(read_dataset(tmp_path / "posed", distortion="undistort").pictures) >= 6
+
+
+def test_a_lens_that_no_camera_has_is_refused_and_leaves_nothing(drive, tmp_path, monkeypatch):
+    """COLMAP finds such of eight pictures straight ahead, of which it places two."""
+
+    def solved(_root, names, *_rest):
+        camera = SourceCamera(Intrinsics(640, 360, 109.0, 109.0, 320.0, 180.0), BrownLens(k1=456.0))
+        points = SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        placed = dict.fromkeys(names[:2], (camera, Pose.identity()))
+        return PlacedPictures(placed, tuple(names[2:]), points)
+
+    monkeypatch.setattr(poses, "solve_poses", solved)
+    pictures = others_of(drive, tmp_path / "ahead")
+    with pytest.raises(DatasetError, match=r"placed 2 of 4 pictures, with a lens.*--parameters"):
+        pose_dataset(pictures, tmp_path / "out", None, SETTINGS, lambda _: None)
+    assert not (tmp_path / "out").exists()
 
 
 def relative(a: SourcePicture, b: SourcePicture) -> Pose:
