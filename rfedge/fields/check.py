@@ -148,14 +148,14 @@ def check_place(field: RadianceField, pictures: Sequence[PosedPicture]) -> float
         middle = np.median(means, axis=0)
         reach_m = float(np.median(np.linalg.norm(means - middle, axis=1)))
     nearest_m = float(np.linalg.norm(eyes - middle, axis=1).min())
-    if nearest_m > FAR * reach_m:
+    if reach_m > 0 and nearest_m > FAR * reach_m:  # an own renderer may state no bounds
         raise InvalidInput(
             "field",
             f"is of another place than the drive: its nearest camera is {nearest_m:.4g} m from the "
             f"field's middle, and half of the field lies within {reach_m:.4g} m; give the field of "
             "this drive, or poses in its frame (rfedge field check)",
         )
-    return _psnr_db(_FieldInDrive(field), _spread(pictures, PAIRS), AS_GIVEN)
+    return _psnr_db(_FieldInDrive(field), spread(pictures, PAIRS), AS_GIVEN)
 
 
 @dataclass(frozen=True)

@@ -361,9 +361,7 @@ class Train:
         config = replace(config, bands=bands, antialiased=self.antialiased)
         return replace(config, exposure=exposure_varies, refine_poses=self.refine_poses)
 
-    def _finished(
-        self, job: TrainingJob, trained: Trained, console: Console
-    ) -> RadianceField:
+    def _finished(self, job: TrainingJob, trained: Trained, console: Console) -> RadianceField:
         from rfcore.field import SplatField
         from rfcore.train.levels import LevelFitConfig
         from rfedge.training.finish import finish_field, size_goal
