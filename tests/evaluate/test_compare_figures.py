@@ -1,6 +1,7 @@
 """Figures of a comparison show every codec asked for, and every marker whole."""
 
 import numpy as np
+import pytest
 
 from rfedge.evaluate.compare.figures import _bd_rates, write_compare_figures
 from rfedge.evaluate.compare.rows import CompareRow, CurveRow
@@ -42,9 +43,11 @@ def test_a_codec_of_ones_own_and_the_anchor_of_a_quick_run_are_drawn(tmp_path):
         assert "x264-our-tools-veryfast" in drawn, name
 
 
-def test_the_marker_of_the_greatest_saving_is_whole():
-    row = CompareRow(**compared("x264-our-tools-medium", "x264-our-tools-medium", -80.0))
-    figure, _ = _bd_rates([row])
+@pytest.mark.parametrize("interval", [[-82.0, -79.0], None])
+def test_the_marker_of_the_greatest_saving_is_whole(interval):
+    """A quick run has no interval."""
+    row = compared("x264-our-tools-medium", "x264-our-tools-medium", -80.0)
+    figure, _ = _bd_rates([CompareRow(**{**row, "ci95": interval})])
     low, high = figure.axes[0].get_xlim()
     assert low < -84
     assert high > 3

@@ -232,10 +232,8 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
         axes.tick_params("y", labelsize=8)
         axes.invert_yaxis()
         axes.set_xlabel("BD-rate of ours against the rival, %")
-        axes.set_xlim(
-            min(min(row.bd_rate_percent, row.ci95[0]) for row in ours) - 5,
-            max(0.0, *(row.bd_rate_percent for row in ours)) + 5,
-        )
+        drawn = [value for row in ours for value in (row.bd_rate_percent, *(row.ci95 or ()))]
+        axes.set_xlim(min(drawn) - 5, max(0.0, *drawn) + 5)
         if axes.lines:
             axes.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1), fontsize=8)
     return figure, lines
