@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from cav_agent.config import PaceKind
-from mec_server.fields.service import CHUNK_BYTES
+from mec_server.fields.service import MESSAGE_BYTES
 from rfcore.field import FieldStore, SplatField
 from rfcore.field.store import encode_field
 from rfcore.raster.gaussians import Gaussians
@@ -32,7 +32,7 @@ async def test_pictures_are_good_while_the_field_arrives(
     store = tmp_path / "fields"
     archive = encode_field(many_splats(street.field, 48).compressed())
     field_id = FieldStore(store).add(archive)
-    assert len(archive) > 5 * CHUNK_BYTES
+    assert len(archive) > 5 * MESSAGE_BYTES
     async with serve(fields=store) as server:
         link = LinkProxy(
             LinkSettings(str(server.address), uplink_bps=1e6, downlink_bps=4e5, delay_ms=5.0)
