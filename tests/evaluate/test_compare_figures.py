@@ -36,7 +36,7 @@ def test_a_codec_of_ones_own_and_the_anchor_of_a_quick_run_are_drawn(tmp_path):
     ]
     rows = [compared("x264-our-tools-veryfast", "x264-our-tools-veryfast", -80.0),
             compared(MINE, MINE, -40.0)]  # fmt: skip
-    write_compare_figures({"rows": rows, "curves": curves}, tmp_path)
+    write_compare_figures({"rows": rows, "curves": curves, "quick": True}, tmp_path)
     for name in ("rd_empty_10", "bd_rates"):
         drawn = (tmp_path / f"{name}.svg").read_text()
         assert MINE in drawn, name
