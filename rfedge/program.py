@@ -13,6 +13,7 @@ import os
 import select
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import cache
 from importlib.metadata import version
 from typing import Protocol
@@ -36,6 +37,17 @@ CONFIG = (
 )
 """Options are named as their fields, choices are written in lower case as in files and on the wire,
 flags have one form, and help shows neither None nor PATH where a word says more."""
+
+
+def working(what: str) -> AbstractContextManager[object]:
+    """Say on standard error what takes long while the block lasts: soon, then ever more rarely."""
+    from rfcore.wire.waits import waiting
+
+    def say(what: str, since_s: float) -> None:
+        sys.stderr.write(f"{what}: {since_s:.0f} s so far\n")
+        sys.stderr.flush()
+
+    return waiting(what, say)
 
 
 SIGPIPE_STATUS = 141

@@ -17,6 +17,7 @@ from rfcore.codec.h264.config import (
     LightChange,
 )
 from rfedge.arguments import DATASET, FIELD, RENDERER, check_folder, open_drive, open_field
+from rfedge.program import working
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -85,7 +86,8 @@ class Encode:
         def watch(coded: CodedFrame) -> None:
             quality.add(coded.given.frame, coded.encoded.reconstruction)
 
-        coded = encode_drive(dataset, field, settings, self._located(field, dataset), watch)
+        with working(f"encoding {len(dataset.pictures)} pictures"):
+            coded = encode_drive(dataset, field, settings, self._located(field, dataset), watch)
         write_drive(self.out, coded)
         payload_bytes = sum(len(frame.packet.payload) for frame in coded.frames)
         size = self.out.stat().st_size

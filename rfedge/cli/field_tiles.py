@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from rfedge.arguments import FIELD, FOLDER, field_path
+from rfedge.program import working
 
 if TYPE_CHECKING:
     from rfcore.wire.tile_manifest import Publication, VersionLabel
@@ -64,7 +65,9 @@ class FieldPublish:
         ground = Ground(area, self.margin_m)
         label = VersionLabel(self.light, "", self.passes, self.time_of_day_h)
         now, path = datetime.now(UTC), field_path(self.field)
-        print(_current(publish(self.folder, self.tile, path, ground, now, label), self.light))
+        with working(f"checking and copying {path}"):
+            published = publish(self.folder, self.tile, path, ground, now, label)
+        print(_current(published, self.light))
 
     def _publish_tiles(self, tiles: tuple[SplitTile, ...]) -> None:
         """Publish every tile of a split, or none where a field is missing."""

@@ -33,6 +33,7 @@ from rfedge.loadtest.drive import (
 from rfedge.loadtest.plan import SETTLING_S, Load, Mode, Vehicles, Verdict, judge
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
 from rfedge.processes import Service, command_of, service
+from rfedge.program import working
 from rfedge.report.charts import RENDER, STYLE, new_axes, svg
 from rfedge.report.page import write_page
 from rfedge.report.tables import text_table
@@ -252,7 +253,9 @@ def run_loads(
 
     def held(vehicles: int) -> bool:
         console.print(f"[bold]{vehicles}[/] vehicles, {load.mode}, {load.hz:g} Hz")
-        runs.append(run_load(replace(load, vehicles=vehicles), bed))
+        times = f"{load.warm_up_s:g} s of warm-up, {load.duration_s:g} s counted"
+        with working(f"starting them, {times}"):
+            runs.append(run_load(replace(load, vehicles=vehicles), bed))
         verdict = runs[-1].verdict
         outcome = "held" if verdict.held else "not held: " + "; ".join(verdict.broken)
         console.print(f"  {outcome}; limit: {verdict.limited_by}")
