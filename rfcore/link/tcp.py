@@ -11,7 +11,7 @@ on a link that loses packets:
 * restart of the window after an idle time; delayed acknowledgements (40 ms)
 
 Not modelled: HyStart, pacing, ECN, limits of the receive window, undoing of a spurious reduction.
-``rfcore.link.lossy`` puts packets on a link; docs/how-to/lossy-links.md compares with the kernel.
+``rfcore.link.lossy`` puts packets on a link; ``rfedge-lab tcp`` compares with the kernel.
 """
 
 from __future__ import annotations
