@@ -32,7 +32,7 @@ from cav_agent.frame_log import DriveObserver
 from cav_agent.frames import FrameResult, Outcome, RetryReason
 from cav_agent.handover import LOST_AFTER_S, Handover, ServedTile, TileRoute
 from rfcore.errors import ProtocolError, RfedgeError
-from rfcore.wire.waits import FIRST_S, WaitLog, log_wait
+from rfcore.wire.waits import WaitLog, log_wait
 
 log = structlog.get_logger()
 
@@ -45,6 +45,9 @@ AHEAD_S, AHEAD_PICTURES = 30.0, 30
 SHORTEST_REST_S = 0.001
 POLL_S = 0.25
 """A stream that breaks between two pictures is noticed within this time."""
+
+ANSWERED_S = 1.0
+"""A drive whose last answer is not older waits for nothing."""
 
 FIRST_RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
 """Pauses before a stream that failed is opened again: longer with every failure in a row."""
@@ -87,7 +90,7 @@ class HandoverController:
         self._was_welcomed = False
         self._failed: RfedgeError | None = None
         self._began_s = self._streaming_at_s = self._answered_at_s = time.monotonic()
-        self._waits = WaitLog(log_wait, first_s=0.0)
+        self._waits = WaitLog(log_wait)
 
     def tiles_published(self, server: int, tiles: Sequence[ServedTile]) -> None:
         """Follow what a server publishes now."""
@@ -152,8 +155,8 @@ class HandoverController:
         self._changed.set()
 
     def _waits_for(self, handover: Handover, now: float) -> str:
-        """Return what the drive waits for, once no picture was answered for ``FIRST_S``."""
-        if now - self._answered_at_s < FIRST_S:
+        """Return what the drive waits for, once no picture was answered for ``ANSWERED_S``."""
+        if now - self._answered_at_s < ANSWERED_S:
             return ""
         waits_for = self._candidate(handover, now).waits_for(now)
         if not waits_for and self._schedule.get_timer() is None and not self._is_done():

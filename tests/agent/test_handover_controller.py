@@ -20,6 +20,7 @@ from cav_agent.metrics import AgentMetrics
 from rfcore.errors import FieldFormatError, ProtocolError, RfedgeError
 from rfcore.wire.address import Address
 from rfcore.wire.tiles import Area, Tile
+from rfcore.wire.waits import WaitLog, log_wait
 
 REFUSED = ProtocolError("hello.field_ids: none is here")
 ADDRESSES = (Address("127.0.0.1", 1), Address("127.0.0.1", 2))
@@ -208,10 +209,12 @@ async def test_every_picture_goes_to_the_tile_it_was_taken_on(drive: Drive, site
 async def test_a_field_that_does_not_come_is_named_as_what_the_drive_waits_for(
     drive: Drive, site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cav_agent.handover_controller.FIRST_S", 0.0)
+    monkeypatch.setattr("cav_agent.handover_controller.ANSWERED_S", 0.0)
     monkeypatch.setattr(site, "prepare", lambda _: asyncio.get_running_loop().create_future())
     with capture_logs() as logs:
-        running = asyncio.create_task(drive(WEST).run())
+        controller = drive(WEST)
+        controller._waits = WaitLog(log_wait, first_s=0.0)
+        running = asyncio.create_task(controller.run())
         while not logs:
             await asyncio.sleep(0)
         running.cancel()
