@@ -216,7 +216,8 @@ class Decode:
         field = open_field(self.field, threads=self.threads, isa=isa)
         originals = self._originals(field, len(drive.frames))
         # A decoder of root becomes another user, and nothing but it runs on what the file says.
-        with Decoders(DecoderKind(self.decoder), as_root=True, quiet=True) as decoders:
+        kind, what = DecoderKind(self.decoder), f"decoding {len(drive.frames)} frames"
+        with working(what), Decoders(kind, as_root=True, quiet=True) as decoders:
             if decoders.problem:
                 print(f"decoded in a {decoders.kind} sandbox: {decoders.problem}")
             decoded = decode_drive(drive, field, decoders.open)
