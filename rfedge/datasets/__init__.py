@@ -43,7 +43,8 @@ class DatasetRecordCarla:
     timeout_s: float = 30.0
     """Give up when the server does not answer for so long, seconds."""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ``InvalidInput`` for what no simulator need be asked about."""
         from rfcore.dataset.rig import mounts_named
 
         mounts_named(self.cameras)
@@ -66,6 +67,7 @@ class DatasetRecordCarla:
         from rfcore.files import whole_folder
         from rfedge.datasets.carla import CarlaRecorder
 
+        self.check()
         with needs("carla"):
             import carla
         with whole_folder(self.out) as folder:

@@ -134,14 +134,6 @@ class Train:
     kind: Literal["splats", "ngp"] = "splats"
     """3D Gaussians, or the hash grid of Instant-NGP; options of Gaussians do not apply to it."""
 
-    def __post_init__(self) -> None:
-        if self.held_out is not None and self.holdout is not None:
-            raise InvalidInput("holdout", "goes without --held-out: choose one of the two")
-        if self.points is not None and self.depths is not None:
-            raise InvalidInput("depths", "goes without --points: choose one of the two")
-        if not 0 < self.views_percent <= 100:
-            raise InvalidInput("views_percent", f"{self.views_percent} is outside 0..100")
-
     @property
     def size_px(self) -> tuple[int, int] | None:
         """The size that pictures are reduced to; raises ``InvalidInput`` for other text."""

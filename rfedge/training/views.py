@@ -84,6 +84,12 @@ def _points_of(picture: PosedPicture, path: Path, count: int) -> PointCloud:
 
 def read_views(job: Train) -> tuple[Dataset, Dataset | None]:
     """Return the pictures to train on and those to measure on, around the same origin."""
+    if job.held_out is not None and job.holdout is not None:
+        raise InvalidInput("holdout", "goes without --held-out: choose one of the two")
+    if job.points is not None and job.depths is not None:
+        raise InvalidInput("depths", "goes without --points: choose one of the two")
+    if not 0 < job.views_percent <= 100:
+        raise InvalidInput("views_percent", f"{job.views_percent} is outside 0..100")
     distortion = Distortion.UNDISTORT if job.undistort else Distortion.REFUSE
     dataset = read_dataset(job.dataset, distortion=distortion, size_px=job.size_px)
     held_out = None
