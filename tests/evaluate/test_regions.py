@@ -65,7 +65,7 @@ def test_bits_go_where_the_frame_differs_from_the_field():
     for luma in noisy:
         luma[moving] = rng.integers(30, 220, moving.sum())
     seen = RenderedClip((wall(),) * 3, (EVERYWHERE,) * 3, "field", 0.0)
-    rows = split_rows(SplitClip([picture(y) for y in noisy], seen, [moving] * 3, "fast", 26.0))
+    rows = split_rows([SplitClip([picture(y) for y in noisy], seen, [moving] * 3, "fast", 26.0)])
     shares = {row["shows"]: row for row in rows}
     assert shares["moving"]["slice_percent"] > 90
     assert shares["moving"]["area_percent"] == pytest.approx(100 * 4 / 24)
@@ -97,7 +97,7 @@ def test_shares_are_whole_and_bytes_are_those_of_the_slices():
     still = picture(np.full(SIZE[::-1], 120, np.uint8))
     views = (replace(wall(), render=still),) * 3
     rendered = RenderedClip(views, (EVERYWHERE,) * 3, "field", 0.0)
-    rows = split_rows(SplitClip(frames, rendered, [NOWHERE] * 3, "fast", 30.0))
+    rows = split_rows([SplitClip(frames, rendered, [NOWHERE] * 3, "fast", 30.0)])
     assert sum(row["area_percent"] for row in rows) == pytest.approx(100)
     assert sum(row["slice_percent"] for row in rows) == pytest.approx(100)
     clip = FieldCoder(rendered, "ours", "test", effort="fast").code(frames, 10, 30.0)
