@@ -34,7 +34,8 @@ from cav_agent.frames import (
 from cav_agent.pending_frames import FramesInFlight, PredictionChain, WaitingInstants
 from cav_agent.rate_control import BitDivision, ByteBudget, RateControl
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
+from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import (
     Ack,
     ClientMessage,
@@ -49,7 +50,7 @@ from rfcore.wire.messages import (
     Welcome,
 )
 from rfcore.wire.notices import StreetNotice
-from rfcore.wire.values import FIELD_ID_PREFIX_BYTES, MAX_PAYLOAD_BYTES
+from rfcore.wire.values import MAX_PAYLOAD_BYTES
 
 
 class LinkState(StrEnum):
@@ -66,11 +67,6 @@ class OutgoingMessage:
 
     message: ClientMessage
     data: bytes
-
-    @classmethod
-    def of(cls, message: ClientMessage) -> OutgoingMessage:
-        """Serialise ``message``."""
-        return cls(message, client_message_to_bytes(message))
 
 
 @dataclass
@@ -123,10 +119,13 @@ class AgentSession:
         }
         self._in_flight = FramesInFlight(self._limits)
         self._connection = 0
+        self._writer = FrameWriter(hello)
         self._waiting = WaitingInstants(
             self._limits.slot_frames, lambda c: self._cameras[c].may_send
         )
         self._job: EncodeJob | None = None
+        self._job_is_after: tuple[FrameWriter, FrameAddress | None] = self._writer, None
+        """What will write the job's frame, and the frame that it will be sent after."""
         self._outbox: deque[OutgoingMessage] = deque()
         self._results: deque[FrameResult] = deque()
         self._greeting_until_s = 0.0
@@ -168,11 +167,12 @@ class AgentSession:
         self.broken = None
         self.is_draining = False
         self._connection += 1
+        self._writer = FrameWriter(self._hello)
         for camera in self._cameras.values():
             camera.granted = camera.used = 0
         self._greeting_until_s = now + self._limits.greeting_s
         self._in_flight.stream_opened()
-        self._outbox.append(OutgoingMessage.of(self._hello))
+        self._outbox.append(OutgoingMessage(self._hello, hello_to_bytes(self._hello)))
 
     def connection_lost(self, end: StreamEnd, now: float) -> None:
         """End every frame that was not answered, since its stream is gone."""
@@ -274,17 +274,17 @@ class AgentSession:
         if capture is None:
             return None
         exact, chain = bool(self.exact), self._cameras[capture.camera_id].chain
-        base = chain.base if exact else None
         budget = self._budgets.get(capture.camera_id)
         self._job = EncodeJob(
             capture,
             chain.epoch,
             self._connection,
-            base,
+            chain.base if exact else None,
             exact=exact,
             budget=budget,
             started_s=now,
         )
+        self._job_is_after = self._writer, chain.base
         chain.started()
         return self._job
 
@@ -317,7 +317,8 @@ class AgentSession:
         """Send the frame of the running job, if its stream still is the same."""
         job = self._take_job()
         frame = self._frame(job.capture, encoded)
-        outgoing = OutgoingMessage.of(frame)
+        writer, after = self._job_is_after
+        outgoing = OutgoingMessage(frame, writer.message(frame, after))
         payload_bytes, packet_bytes = len(encoded.packet.payload), len(outgoing.data)
         if self._rate_control is not None:
             self._rate_control.coded(encoded.sender_s, payload_bytes, packet_bytes)
@@ -383,7 +384,7 @@ class AgentSession:
             capture.camera_id,
             capture.capture_time_ns,
             encoded.pose,
-            bytes.fromhex(encoded.field_id)[:FIELD_ID_PREFIX_BYTES],
+            encoded.field_id,
             encoded.packet,
             encoded.rung.quality,
             capture.clock,

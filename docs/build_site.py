@@ -82,6 +82,7 @@ FORMATS: Mapping[str, str] = {
     "Colour layers": "rfcore.field.layer",
     "Deltas of fields": "rfcore.field.delta",
     "Coded drives, `.rfv`": "rfcore.wire.drive_file",
+    "Heads of frames, on the wire and in drives": "rfcore.wire.head",
     "Published tiles, `tiles.json`": "rfcore.wire.tile_manifest",
     "Recordings of a server": "rfcore.dataset.recorded_session",
 }

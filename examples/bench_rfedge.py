@@ -15,8 +15,9 @@ from pathlib import Path
 
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
-from rfcore.wire.convert import client_message_from_bytes, client_message_to_bytes
+from rfcore.wire.convert import client_message_from_bytes, hello_to_bytes
 from rfcore.wire.drive_file import CodedDrive
+from rfcore.wire.head import FrameReader, FrameWriter
 from rfedge.offline import CodingSettings, decode_drive, encode_drive
 
 CLOCK_NS = 1_700_000_000_000_000_000
@@ -26,11 +27,10 @@ CLOCK_NS = 1_700_000_000_000_000_000
 def encode(field_file: Path, frames: Path, out: Path, crf: float) -> None:
     field = load_field(field_file)
     coded = encode_drive(read_dataset(frames / "transforms.json"), field, CodingSettings(crf=crf))
-    hello = client_message_to_bytes(coded.hello)
+    hello = hello_to_bytes(coded.hello)
     begins = len(hello).to_bytes(2, "big") + hello
-    for index, frame in enumerate(coded.frames):
-        taken_ns = CLOCK_NS + frame.capture_time_ns
-        message = client_message_to_bytes(replace(frame, capture_time_ns=taken_ns))
+    frames = (replace(f, capture_time_ns=CLOCK_NS + f.capture_time_ns) for f in coded.frames)
+    for index, message in enumerate(FrameWriter(coded.hello).in_order(frames)):
         (out / f"{index:04d}.packet").write_bytes((b"" if index else begins) + message)
     decode(field_file, out, out)
 
@@ -39,9 +39,10 @@ def decode(field_file: Path, packets: Path, out: Path) -> None:
     first, *more = (file.read_bytes() for file in sorted(packets.glob("*.packet")))
     ends = 2 + int.from_bytes(first[:2], "big")
     hello = client_message_from_bytes(first[2:ends])
-    frames = map(client_message_from_bytes, (first[ends:], *more))
+    reader = FrameReader(hello)
+    frames = [reader.frame(client_message_from_bytes(m)) for m in (first[ends:], *more)]
     for index, shown in enumerate(
-        decode_drive(CodedDrive(hello, (*frames,)), load_field(field_file))
+        decode_drive(CodedDrive(hello, tuple(frames)), load_field(field_file))
     ):
         (out / f"{index:04d}.yuv").write_bytes(shown.frame.packed())
 

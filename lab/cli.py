@@ -14,6 +14,7 @@ from lab.benchmark import EvalBenchmark
 from lab.city import PlanCity
 from lab.classes import EvalClasses
 from lab.cold_start import EvalColdStart
+from lab.head import EvalHead
 from lab.intra_size import EvalIntraSize
 from lab.latency import EvalLatency
 from lab.live import EvalLive
@@ -36,6 +37,7 @@ Verb = (
     | Annotated[EvalClasses, subcommand("classes")]
     | Annotated[EvalColdStart, subcommand("cold-start")]
     | Annotated[MakeFeed, subcommand("feed")]
+    | Annotated[EvalHead, subcommand("head")]
     | Annotated[EvalIntraSize, subcommand("intra-size")]
     | Annotated[EvalLatency, subcommand("latency")]
     | Annotated[EvalLive, subcommand("live")]

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from rfcore.codec.packet import CheckedPacket, check_packet
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.wire.messages import CameraDescription, Credit, Frame, FrameAddress, Hello
-from rfcore.wire.values import FIELD_ID_PREFIX_BYTES, shown
 
 MAX_GAP = 64
 """Sequences that may be missing at once; credits keep an honest sender far below it."""
@@ -80,8 +79,8 @@ class CameraQueue:
         return self._running
 
     def check(self, frame: Frame) -> CheckedPacket:
-        """Return the packet of a frame; raise ``PacketRejected`` if it is damaged or cannot follow
-        what was reconstructed last."""
+        """Return the packet of a frame; raise ``PacketRejected`` if it cannot follow what was
+        reconstructed last."""
         packet = frame.packet
         current = packet.epoch if self.epoch is None else self.epoch
         checked = check_packet(packet, current, self._expected(current))
@@ -136,7 +135,7 @@ class CameraQueue:
 
 
 class SessionCameras:
-    """The queues of a session's cameras by id, and the fields that their frames may name.
+    """The queues of a session's cameras by id.
 
     Empty until ``open``; every method may be called before.
     """
@@ -145,16 +144,14 @@ class SessionCameras:
         self._window = window
         self._queues: dict[str, CameraQueue] = {}
         self._descriptions: dict[str, CameraDescription] = {}
-        self._fields: dict[bytes, str] = {}
+        self._first_field_id = ""
 
     def open(self, hello: Hello) -> None:
-        """Make a queue for each camera of ``hello``, and know its fields by their prefixes."""
+        """Make a queue for each camera of ``hello``."""
         for camera in hello.cameras:
             self._queues[camera.camera_id] = CameraQueue(self._window)
             self._descriptions[camera.camera_id] = camera
-        for field_id in hello.field_ids:
-            self._fields[bytes.fromhex(field_id)[:FIELD_ID_PREFIX_BYTES]] = field_id
-        self._fields[b""] = hello.field_ids[0]
+        self._first_field_id = hello.field_ids[0]
 
     @property
     def are_busy(self) -> bool:
@@ -162,20 +159,9 @@ class SessionCameras:
         return any(queue.outstanding for queue in self._queues.values())
 
     def queue_of(self, frame: Frame) -> CameraQueue:
-        """Return the queue of a frame's camera.
-
-        Raises ``InvalidInput`` for a camera or a field that Hello did not name.
-        """
+        """Return the queue of a frame's camera; raise ``InvalidInput`` before ``open``."""
         if frame.camera_id not in self._queues:
-            raise InvalidInput(
-                "frame.camera_id", f"{shown(frame.camera_id)} is not a camera of this Hello"
-            )
-        if frame.field_id_prefix not in self._fields:
-            raise InvalidInput(
-                "frame.field_id_prefix",
-                f"{frame.field_id_prefix.hex()} is not a field of this Hello "
-                f"({', '.join(dict.fromkeys(self._fields.values()))})",
-            )
+            raise InvalidInput("frame", "came before Welcome; wait for that")
         return self._queues[frame.camera_id]
 
     def posed(self, frame: Frame) -> Frame:
@@ -184,7 +170,7 @@ class SessionCameras:
 
     def field_of(self, frame: Frame) -> str:
         """Return the id of the field that the frame of a queue is predicted from."""
-        return self._fields[frame.field_id_prefix]
+        return frame.field_id or self._first_field_id
 
     def refuse(self, address: FrameAddress) -> None:
         """Note that a message is answered with a Nack.

@@ -20,7 +20,7 @@ from types import MappingProxyType
 from mec_server.camera_queue import SessionCameras
 from mec_server.config import SessionLimits
 from mec_server.ledger.budgets import Limit
-from rfcore.codec.packet import CheckedPacket
+from rfcore.codec.packet import RECONSTRUCTION_DIGEST_BYTES, CheckedPacket
 from rfcore.errors import (
     AccessDenied,
     InvalidInput,
@@ -31,7 +31,7 @@ from rfcore.errors import (
     RfedgeError,
     UnknownField,
 )
-from rfcore.wire.convert import FrameRefused
+from rfcore.wire.head import FrameRefused
 from rfcore.wire.messages import (
     OUR_CONTRACT,
     Ack,
@@ -137,7 +137,6 @@ class ServerSession:
         self._deadline_s = now + self._limits.hello_s
         self._heard_s = now
         self._unusable = 0
-        self._damaged: deque[tuple[Frame, PacketRejected]] = deque(maxlen=MAX_UNUSABLE)
         self._exact = False
         self._rate_hz = 0.0
         self._is_to_drain = False
@@ -152,10 +151,13 @@ class ServerSession:
         else:
             self._receive_frame(message, now)
 
-    def refuse(self, error: InvalidInput, now: float) -> None:
+    def refuse(self, error: InvalidInput | FrameRefused, now: float) -> None:
         """Answer for a message that failed its checks; the session lives on."""
-        address = error.address if isinstance(error, FrameRefused) else FrameAddress("", 0, 0)
-        self._refuse(address, RejectReason.INVALID_ARGUMENT, str(error), now)
+        if isinstance(error, FrameRefused):
+            self._refuse(error.address, error.reason, error.problem, now)
+        else:
+            address = FrameAddress("", 0, 0)
+            self._refuse(address, RejectReason.INVALID_ARGUMENT, str(error), now)
 
     def overrun(self, frame: Frame, error: LimitExceeded, now: float) -> None:
         """Answer for a frame beyond a budget; the session lives on."""
@@ -215,7 +217,7 @@ class ServerSession:
                 raise PacketRejected(RejectReason.OVERLOADED, "this server is shutting down")
             queue.admit(self._cameras.posed(frame), now)
         except InvalidInput as error:
-            self.refuse(FrameRefused(error, frame.address), now)
+            self._refuse(frame.address, RejectReason.INVALID_ARGUMENT, str(error), now)
         except PacketRejected as error:
             self._refuse(frame.address, error.reason, error.problem, now)
 
@@ -224,7 +226,7 @@ class ServerSession:
     def jobs_to_start(self, now: float) -> list[OpenJob | DecodeJob]:
         """Return the work that can begin now: one frame a camera, in order.
 
-        Frames that are stale or damaged (a wrong CRC) are answered here: they cost no rendering.
+        Frames that are stale are answered here: they cost no rendering.
         """
         jobs: list[OpenJob | DecodeJob] = []
         if self._opening is not None and self.state is SessionState.OPENING:
@@ -236,24 +238,13 @@ class ServerSession:
                 packet = queue.check(frame)
             except PacketRejected as error:
                 queue.fail()
-                self._refuse_unstarted(frame, error)
+                self._nack(frame.address, error.reason, error.problem)
+                self._unusable_frame()
             else:
                 field_id = self._cameras.field_of(frame)
                 jobs.append(DecodeJob(frame, packet, field_id, waiting.received_s, now))
         self._finish_draining()
         return jobs
-
-    def _refuse_unstarted(self, frame: Frame, error: PacketRejected) -> None:
-        self._nack(frame.address, error.reason, error.problem)
-        if error.reason is RejectReason.CRC_MISMATCH:
-            self._damaged.append((frame, error))
-        self._unusable_frame()
-
-    def take_damaged(self) -> list[tuple[Frame, PacketRejected]]:
-        """Return, once, the frames that were refused for their CRC, and why: for the log."""
-        damaged = list(self._damaged)
-        self._damaged.clear()
-        return damaged
 
     def opened(self, job: OpenJob, now: float) -> None:
         """Fields and decoders of ``job`` are ready."""
@@ -291,7 +282,8 @@ class ServerSession:
         self._nack(FrameAddress("", 0, 0), RejectReason.INVALID_ARGUMENT, str(error))
 
     def decoded(self, job: DecodeJob, digest: bytes, times: StageTimes, now: float) -> None:
-        """Note that the frame of ``job`` was reconstructed, to a picture of ``digest``."""
+        """Note that the frame of ``job`` was reconstructed, to a picture of ``digest``; the vehicle
+        is told as much of that as its frame had."""
         self._unusable = 0
         address = job.frame.address
         for gap in self._cameras.queue_of(job.frame).succeed():
@@ -304,7 +296,7 @@ class ServerSession:
             decode_ns=times.decode_ns,
             total_ns=_ns(now - job.received_s),
         )
-        self._say(Ack(address, times, digest))
+        self._say(Ack(address, times, digest[:RECONSTRUCTION_DIGEST_BYTES]))
         self._answered(now)
 
     def rejected(self, job: DecodeJob, error: PacketRejected, now: float) -> None:

@@ -36,11 +36,12 @@ from mec_server.session import (
 )
 from mec_server.twin.state import ReceivedPicture, Twin
 from rfcore.camera import Intrinsics
-from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
+from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, ProtocolError, RfedgeError
 from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
-from rfcore.wire.messages import Frame, Hello, RendererContract
+from rfcore.wire.head import FrameReader, FrameRefused
+from rfcore.wire.messages import Frame, FrameAddress, Hello, RendererContract
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.tls import peer_identity
 
@@ -103,6 +104,7 @@ class Stream:
         self._is_closed = False
         self._decoders = StreamDecoders(server.decoding, session_id)
         self._intrinsics: dict[str, Intrinsics] = {}
+        self._reader: FrameReader | None = None
         self._fault: Exception | None = None
         self._metrics = server.metrics.of(UNKNOWN_VEHICLE)
         self._peer = context.peer()
@@ -220,8 +222,6 @@ class Stream:
                 self._expect(job)
             else:
                 self._opening = self._tasks.create_task(self._open(job))
-        for frame, error in self._session.take_damaged():
-            self._log_rejected(frame, error)
         if self._session.has_news:
             self._wake.set()
 
@@ -278,16 +278,25 @@ class Stream:
         excess = self._excess(lambda: self._account.spend_message(len(data), now))
         try:
             message = client_message_from_bytes(data)
+            frame = self._frame(message) if isinstance(message, bytes) else None
+        except FrameRefused as error:
+            self._log_rejected(error.address, error)
+            self._session.refuse(error, now)
         except InvalidInput as error:
             self._log.warning("message refused", problem=str(error))
             self._session.refuse(error, now)
-            return
-        if isinstance(message, Frame):
-            self._receive_frame(message, len(data), excess, now)
-        elif excess is not None:
-            self._session.end(excess)
+        except ProtocolError as error:
+            self._session.end(error)
         else:
-            self._receive_hello(message, now)
+            if isinstance(message, Hello):
+                self._receive_hello(message, excess, now)
+            elif frame is not None:
+                self._receive_frame(frame, len(data), excess, now)
+
+    def _frame(self, data: bytes) -> Frame:
+        if self._reader is None:
+            raise ProtocolError("a frame came before Hello")
+        return self._reader.frame(data)
 
     def _excess(self, spend: Callable[[], None]) -> LimitExceeded | None:
         """Return the limit that ``spend`` exceeds, if it does: counted, and logged once."""
@@ -301,12 +310,16 @@ class Stream:
             return error
         return None
 
-    def _receive_hello(self, hello: Hello, now: float) -> None:
-        self._opened_time_ns = time.time_ns()
+    def _receive_hello(self, hello: Hello, excess: LimitExceeded | None, now: float) -> None:
         session = self._session
+        if excess is not None:
+            session.end(excess)
+            return
+        self._opened_time_ns = time.time_ns()
         session.receive(hello, now)
         if session.state is not SessionState.OPENING:
             return
+        self._reader = FrameReader(hello)
         try:
             rate_hz = self._account.enter(hello, self, now)
         except LimitExceeded as error:
@@ -402,7 +415,7 @@ class Stream:
         return latency_s
 
     def _rejected(self, job: DecodeJob, error: PacketRejected, worker_s: float, now: float) -> None:
-        self._log_rejected(job.frame, error)
+        self._log_rejected(job.frame.address, error)
         self._session.rejected(job, error, now)
         if isinstance(error, RenderTooLate):
             self._server.metrics.count_limited(Limit.RENDER_DEADLINE)
@@ -414,12 +427,12 @@ class Stream:
         except LimitExceeded as barred:
             self._session.end(barred)
 
-    def _log_rejected(self, frame: Frame, error: PacketRejected) -> None:
+    def _log_rejected(self, address: FrameAddress, error: PacketRejected) -> None:
         self._log.warning(
             "frame rejected",
-            camera=frame.camera_id,
-            epoch=frame.packet.epoch,
-            seq=frame.packet.sequence,
+            camera=address.camera_id,
+            epoch=address.epoch,
+            seq=address.sequence,
             reason=str(error.reason),
             problem=error.problem,
         )

@@ -14,7 +14,6 @@ bit-exact renderer relies on.
 from __future__ import annotations
 
 import math
-from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -124,14 +123,11 @@ class Pose:
         return Pose(t, _quaternion_from_rotation(m))
 
     def rounded(self) -> Pose:
-        """Return the pose rounded to float32 numbers, which take half the bytes on the wire.
+        """Return the nearest pose that can be sent: that of the default ``PoseLattice``.
 
-        Within 1 km of the tile's origin this moves it by at most 0.031 mm along an axis and turns
-        it by at most 1.2e-7 rad. Raises ``InvalidInput`` for metres beyond float32.
+        It moves the pose by at most 0.25 mm along each axis and turns it by at most 5.3e-5 rad.
         """
-        x, y, z = array("f", self.translation_m)
-        a, b, c, d = array("f", self.rotation)
-        return Pose((x, y, z), (a, b, c, d))
+        return LATTICE.pose(LATTICE.steps(self))
 
     def rotation_matrix(self) -> Mat3:
         """Return the 3x3 rotation, rows first, from the normalised quaternion."""
@@ -171,6 +167,53 @@ class Pose:
             aw * bz + ax * by - ay * bx + az * bw,
         )
         return Pose(self.apply(other.translation_m), _normalised(product))
+
+
+PoseSteps = tuple[int, int, int, int, int, int, int]
+"""A pose on a lattice: x, y, z in steps, and a quaternion w, x, y, z whose largest part is the
+lattice's ``rotation_steps``."""
+
+
+@dataclass(frozen=True)
+class PoseLattice:
+    """The poses that can be sent, as whole numbers; both ends make the same float64 pose of them.
+
+    Metres are multiples of 1 / ``steps_per_m``. The parts of a quaternion are multiples of 1 /
+    ``rotation_steps`` of its largest part, so that a step turns by 1 to 2 ``rotation_steps``ths of
+    a radian. The first of the largest parts is positive. From numbers to the pose there are only
+    divisions and a square root, which IEEE 754 defines to the last bit.
+    """
+
+    steps_per_m: int = 2000
+    rotation_steps: int = 1 << 15
+
+    def __post_init__(self) -> None:
+        for name, least, most in (("steps_per_m", 1, 10**6), ("rotation_steps", 1 << 8, 1 << 20)):
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise InvalidInput(f"lattice.{name}", f"{value} is outside {least}..{most}")
+
+    def steps(self, pose: Pose) -> PoseSteps:
+        """Return the numbers of the lattice's pose nearest to ``pose``."""
+        x, y, z = (round(metres * self.steps_per_m) for metres in pose.translation_m)
+        largest = max(pose.rotation, key=abs)
+        parts = [round(part / largest * self.rotation_steps) for part in pose.rotation]
+        if next(part for part in parts if abs(part) == self.rotation_steps) < 0:
+            parts = [-part for part in parts]
+        w, a, b, c = parts
+        return x, y, z, w, a, b, c
+
+    def pose(self, steps: PoseSteps) -> Pose:
+        """Return the pose of these numbers."""
+        x, y, z, *parts = steps
+        norm = math.sqrt(sum(part * part for part in parts))
+        w, a, b, c = (part / norm for part in parts)
+        per_m = self.steps_per_m
+        return Pose((x / per_m, y / per_m, z / per_m), (w, a, b, c))
+
+
+LATTICE = PoseLattice()
+"""What senders round to."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import grpc
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
 from mec_server.session import DecodeJob, OpenJob
 from rfcore.wire.conventions import CHANNEL_OPTIONS, CONSUMER_OPTIONS, STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Hello, Welcome
 from rfcore.wire.tls import TlsFiles
@@ -82,7 +82,7 @@ def channel_to(address: object, tls: TlsFiles) -> grpc.aio.Channel:
 async def open_stream(channel: grpc.aio.Channel, hello: Hello, metadata: Any = ()) -> Any:
     """Open a vehicle's stream and expect its Welcome."""
     stream = channel.stream_stream(STREAM_METHOD)(metadata=metadata)
-    await stream.write(client_message_to_bytes(hello))
+    await stream.write(hello_to_bytes(hello))
     (welcome, *_) = server_messages_from_bytes(await stream.read())
     assert isinstance(welcome, Welcome)
     return stream

@@ -1,12 +1,13 @@
 """Laws of poses and cameras: groups, golden points, and refusals that name the value."""
 
 import math
+from itertools import product
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import LATTICE, Camera, Intrinsics, Pose, PoseLattice
 from rfcore.errors import InvalidInput
 
 coordinate = st.floats(-1e7, 1e7)
@@ -115,15 +116,29 @@ def test_bad_poses_are_refused_by_name(translation_m, rotation, named):
 
 @given(poses())
 def test_a_rounded_pose_is_near_and_stays_as_it_is(pose):
-    """Half a step of float32: 2**-25 of a number below 1, 2**-24 of any; the angle between unit
-    quaternions is twice the one between them as vectors."""
+    """Half a step along each axis; of the quaternion's parts at most half a step times the largest,
+    and the angle between unit quaternions is twice the one between them as vectors."""
     rounded = pose.rounded()
     assert rounded.rounded() == rounded
     for near, true in zip(rounded.translation_m, pose.translation_m, strict=True):
-        assert abs(near - true) <= 2**-24 * abs(true) + 2**-149
-    assert math.dist(rounded.rotation, pose.rotation) <= 2 * 2**-24
+        assert abs(near - true) <= 0.25e-3 + 1e-15 * abs(true)
+    turned_rad = 2 * math.asin(math.hypot(*rounded.inverse().compose(pose).rotation[1:]))
+    assert turned_rad <= math.sqrt(3) / LATTICE.rotation_steps
 
 
-def test_a_pose_beyond_float32_cannot_be_rounded():
-    with pytest.raises(InvalidInput, match=r"pose.translation_m"):
-        Pose((1e39, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)).rounded()
+@given(st.sampled_from(list(product((-1, 0, 1), repeat=4))[1:]), st.floats(-1e-9, 1e-9))
+def test_a_pose_with_equal_parts_is_rounded_once(signs, tilt):
+    parts = [sign + tilt * place for place, sign in enumerate(signs)]
+    norm = math.hypot(*parts)
+    assume(norm > 0.5)
+    rounded = Pose((0.0, 0.0, 0.0), tuple(part / norm for part in parts)).rounded()
+    assert rounded.rounded() == rounded
+    steps = LATTICE.steps(rounded)
+    assert next(s for s in steps[3:] if abs(s) == LATTICE.rotation_steps) > 0
+    assert LATTICE.pose(steps) == rounded
+
+
+@pytest.mark.parametrize("wrong", [{"steps_per_m": 0}, {"rotation_steps": 1 << 21}])
+def test_a_lattice_out_of_range_is_refused(wrong):
+    with pytest.raises(InvalidInput, match=next(iter(wrong))):
+        PoseLattice(**wrong)

@@ -22,7 +22,7 @@ from lab.city.traffic import TrafficBlock
 from mec_server.config import AdmissionLimits
 from rfcore.errors import InvalidInput
 from rfcore.link.plan import read_link
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.head import FrameWriter
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.prerecorded import PrerecordedDrive
 from rfedge.loadtest.run import Run, TestBed, recorded, run_load
@@ -186,7 +186,8 @@ def _shared(job: PlannedLoad, costs: Costs, vehicles: int) -> SharedLoad:
 
 def _unloaded_costs(job: PlannedLoad, server_s: float) -> Costs:
     drive = PrerecordedDrive.read(recorded(job.load(1), job.bed))
-    sizes = np.array([len(client_message_to_bytes(frame)) for frame in drive.chain])
+    messages = FrameWriter(drive.hello).in_order(drive.chain)
+    sizes = np.array([len(message) for message in messages])
     overhead = 1 + Assumptions().overhead_percent / 100
     return Costs(
         cameras=1,

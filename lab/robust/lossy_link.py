@@ -34,7 +34,7 @@ from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.metrics import ssim
-from rfedge.evaluate.field_coder import RenderedClip, message_bytes
+from rfedge.evaluate.field_coder import MessageWriter, RenderedClip
 from rfedge.offline import Arrival, decode_frames
 
 DATAGRAM_BYTES = 1200
@@ -227,13 +227,14 @@ class LossySender:
         """Yield what comes out of the link, None for a lost frame; the first one always arrives, as
         after a handshake. ``feedback`` must be told of a frame before the next is asked for."""
         link, pasts = self._crossing.link(), dict[int | None, Past | None]()
+        writer = MessageWriter(self._coder.header, self._crossing.rate_hz)
         render_only = self._policy is Policy.RENDER_ONLY
         for index in range(len(self._crossing.frames)):
-            base = pasts.get(self.feedback.base(self._policy))
-            made = self._coder.code(index, base, render_only=render_only)
+            base = self.feedback.base(self._policy)
+            made = self._coder.code(index, pasts.get(base), render_only=render_only)
             pasts[index] = made.state.past
             arrival = self._coder.arrival(index, made)
-            self.frame_bytes.append(message_bytes(arrival))
+            self.frame_bytes.append(len(writer.message(arrival, base)))
             delivered = link.delivers(self.frame_bytes[-1])
             yield arrival if delivered or index == 0 else None
 

@@ -9,8 +9,8 @@ The order is the one in which the decoder is fed: the last picture is reference 
 blocks copy and whose index costs least.
 
 Between frames each end keeps sequence numbers and frames to predict from. A decoded frame is
-identified by the digest of its picture. A packet that predicts from an earlier frame names it
-(``DeltaPacket.base_digest``, the first bytes of that digest), and its own ``reconstruction_digest``
+identified by the digest of its picture. A packet that predicts from an earlier frame names it by
+the first bytes of that digest (``DeltaPacket.base_digest``), and its own ``reconstruction_digest``
 identifies the frame it makes. The sender predicts from one frame at a time, and the caller chooses
 it: the last one sent or, after a loss, the last one known to have been decoded. The receiver keeps
 the last few, so rolling back needs no restart.

@@ -1,8 +1,10 @@
 """A coded drive in a file, ``.rfv``: the messages a vehicle sends, without the server's answers.
 
 Layout: 8 bytes of magic, then messages in protobuf's length-prefixed form: one ``StreamRequest``
-with Hello, then one for every Frame. The magic holds a carriage return, a control-Z and a line
-feed, so that a transfer that converts line ends is noticed at once (as in PNG).
+with Hello, then one for every frame, each sent after the one of its camera before it
+(``rfcore.wire.head``): a drive is read from its start. The magic holds a carriage return, a
+control-Z and a line feed, so that a transfer that converts line ends is noticed at once (as in
+PNG).
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -19,8 +22,9 @@ from google.protobuf.proto import parse_length_prefixed, serialize_length_prefix
 from rfcore.errors import InvalidData
 from rfcore.files import whole_file
 from rfcore.wire.conventions import MAX_MESSAGE_BYTES
-from rfcore.wire.convert import client_message_from_wire, client_message_to_wire
-from rfcore.wire.messages import ClientMessage, Frame, Hello
+from rfcore.wire.convert import client_message_from_wire, hello_to_bytes
+from rfcore.wire.head import FrameReader, FrameRefused, FrameWriter
+from rfcore.wire.messages import Frame, Hello
 from rfcore.wire.v1 import edge_pb2 as pb
 
 MAGIC = b"RFV1\r\n\x1a\n"
@@ -38,9 +42,10 @@ def write_drive(path: Path, drive: CodedDrive) -> None:
     """Write ``drive``; the file appears whole or not at all. Raises ``OSError``."""
     with whole_file(path) as file:
         file.write(MAGIC)
-        messages: tuple[ClientMessage, ...] = (drive.hello, *drive.frames)
-        for message in messages:
-            serialize_length_prefixed(client_message_to_wire(message), cast("BytesIO", file))
+        frames = FrameWriter(drive.hello).in_order(drive.frames)
+        for message in chain((hello_to_bytes(drive.hello),), frames):
+            request = pb.StreamRequest.FromString(message)
+            serialize_length_prefixed(request, cast("BytesIO", file))
 
 
 def read_drive(path: Path) -> CodedDrive:
@@ -65,18 +70,19 @@ def read_drive(path: Path) -> CodedDrive:
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise InvalidData(f"{path}: not a coded drive (.rfv), the first bytes are wrong")
-        messages = list(_messages(file, path))
-    if not messages or not isinstance(messages[0], Hello):
-        raise InvalidData(f"{path}: message 0 is not a Hello")
-    cameras = {camera.camera_id for camera in messages[0].cameras}
-    frames: list[Frame] = []
-    for number, message in enumerate(messages[1:], 1):
-        if not isinstance(message, Frame):
-            raise InvalidData(f"{path}: message {number} is a second Hello")
-        if message.camera_id not in cameras:
-            raise InvalidData(f"{path}: message {number} is of a camera that Hello does not name")
-        frames.append(message)
-    return CodedDrive(messages[0], tuple(frames))
+        messages = _messages(file, path)
+        hello = next(messages, None)
+        if not isinstance(hello, Hello):
+            raise InvalidData(f"{path}: message 0 is not a Hello")
+        reader, frames = FrameReader(hello), []
+        for number, message in enumerate(messages, 1):
+            if isinstance(message, Hello):
+                raise InvalidData(f"{path}: message {number} is a second Hello")
+            try:
+                frames.append(reader.frame(message))
+            except FrameRefused as error:
+                raise InvalidData(f"{path}: message {number}: {error}") from error
+    return CodedDrive(hello, tuple(frames))
 
 
 class _BoundedReader:
@@ -99,7 +105,7 @@ class _BoundedReader:
         return data
 
 
-def _messages(file: BinaryIO, path: Path) -> Iterator[ClientMessage]:
+def _messages(file: BinaryIO, path: Path) -> Iterator[Hello | bytes]:
     reader, number = _BoundedReader(file), 0
     while True:
         try:

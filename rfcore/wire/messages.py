@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
+from rfcore.camera import LATTICE, Camera, Intrinsics, Pose, PoseLattice, camera_on_rig
 from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import RejectReason
@@ -74,7 +74,8 @@ class Hello:
     """The first message of a stream.
 
     ``allow_recording`` says whether the server may keep more than the newest pictures,
-    ``take_notices`` whether it should send notices about the street.
+    ``take_notices`` whether it should send notices about the street. The poses of frames are on
+    ``lattice``.
     """
 
     vehicle_id: str
@@ -83,6 +84,7 @@ class Hello:
     renderer: RendererContract
     allow_recording: bool = False
     take_notices: bool = False
+    lattice: PoseLattice = LATTICE
 
 
 @dataclass(frozen=True)
@@ -90,19 +92,19 @@ class Frame:
     """One coded picture.
 
     ``pose`` is world_from_cam, tile-relative, or world_from_rig until ``CameraDescription.posed``;
-    it takes half the bytes on the wire when it is ``Pose.rounded``. It is ``None`` while the camera
-    is lost; then the field shows nothing to either end. Pictures of a rig with the same ``instant``
-    were taken together; 0 stands for a camera alone. An empty ``field_id_prefix`` means the first
-    field of Hello. ``quality`` is what the vehicle rendered the field with, and what the server has
-    to render it with. ``clock`` is the source of a live camera's ``capture_time_ns``.
-    ``localisation`` is the state of a vehicle that finds its camera in the field; it is ``None``
-    where the pose was given.
+    it is on the lattice of Hello (``Pose.rounded``). It is ``None`` while the camera is lost; then
+    the field shows nothing to either end. ``capture_time_ns`` is sent in whole microseconds.
+    Pictures of a rig with the same ``instant`` were taken together; 0 stands for a camera alone. An
+    empty ``field_id`` means the first field of Hello. ``quality`` is what the vehicle rendered the
+    field with, and what the server has to render it with. ``clock`` is the source of a live
+    camera's ``capture_time_ns``. ``localisation`` is the state of a vehicle that finds its camera
+    in the field; it is ``None`` where the pose was given.
     """
 
     camera_id: str
     capture_time_ns: int
     pose: Pose | None
-    field_id_prefix: bytes
+    field_id: str
     packet: DeltaPacket
     quality: Quality = FULL
     clock: ClockKind | None = None
@@ -151,7 +153,8 @@ class StageTimes:
 
 @dataclass(frozen=True)
 class Ack:
-    """The frame was reconstructed; the digest is that of the server's picture."""
+    """The frame was reconstructed; the digest is that of the server's picture, as long as the
+    frame's."""
 
     address: FrameAddress
     times: StageTimes

@@ -44,9 +44,6 @@ MAX_RATE_HZ = 1000.0
 MAX_TRANSLATION_M = 1e6
 """A pose this far from its tile's origin belongs to another tile."""
 
-FIELD_ID_PREFIX_BYTES = 8
-"""Of the 32 bytes of a field's sha256, how many each frame repeats."""
-
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 

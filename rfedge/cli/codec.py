@@ -169,11 +169,12 @@ class _Quality:
         """Return a line that compares with x264 at equal PSNR, without the first frame."""
         import numpy as np
 
-        from rfcore.wire.convert import client_message_to_bytes
+        from rfcore.wire.head import FrameWriter
         from rfedge.evaluate.clips import CodedClip
         from rfedge.evaluate.rivals import percent_against_x264
 
-        sizes = np.array([len(client_message_to_bytes(frame)) for frame in coded.frames])
+        messages = FrameWriter(coded.hello).in_order(coded.frames)
+        sizes = np.array([len(message) for message in messages])
         mse = np.array(self._mse)
         ours = CodedClip(crf, sizes, mse, np.zeros_like(mse), cpu_ms=0.0)
         percent = percent_against_x264(ours, self._frames, rate_hz)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.photometric import Photometric
 from rfcore.codec.references import INTRA, Reference, References, is_temporal, references_name
@@ -29,19 +30,27 @@ from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.views import FieldView
-from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.messages import Frame
+from rfcore.wire.head import FrameWriter
+from rfcore.wire.messages import OUR_CONTRACT, CameraDescription, Frame, FrameAddress, Hello
 from rfedge.evaluate.clips import CodedClip, Notes, luma_sse
 from rfedge.evaluate.rivals import CodedPictures
-from rfedge.offline import Arrival, CodedFrame, FrameInput, decode_promised, encode_frames
+from rfedge.offline import (
+    CAMERA_ID,
+    OFFLINE_VEHICLE,
+    Arrival,
+    CodedFrame,
+    FrameInput,
+    decode_promised,
+    encode_frames,
+)
 
 LIMITS = (1.0, 51.0)
 CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
 COVERED = 0.5
 WITHOUT_FIELD: References = (Reference.PREVIOUS,)
 """References of a coder without a field: each frame from the one before, the first alone."""
-MESSAGE_CAMERA = "front"
 MESSAGE_TIME_NS = 1_700_000_000_000_000_000
+"""When the first frame of a clip was taken; later ones are taken at the clip's rate."""
 
 
 @dataclass(frozen=True)
@@ -168,21 +177,18 @@ class FieldCoder:
         return part
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
-        """Code and decode ``frames`` at CRF ``point``; ``rate_hz`` changes nothing here.
+        """Code and decode ``frames`` at CRF ``point``, taken at ``rate_hz``.
 
         The clip may be the beginning of the one that was rendered. Raises ``InvalidInput`` for a
         longer one, ``CodecError`` if a receiver does not see what the sender promised.
         """
-        del rate_hz
-        coded, made = self._coded(frames, point)
+        coded, made, messages = self._coded(frames, rate_hz, point)
         packets = [coded_frame.encoded.packet for coded_frame in coded]
         notes: dict[str, Notes] = {
             "references": tuple(references_name(packet.references) for packet in packets),
             "slice_bytes": tuple(len(packet.payload) for packet in packets),
             "relit": tuple(float(packet.relit) for packet in packets),
-            "message": tuple(
-                _digest_of(_message(frame.arrival, self._rendered.quality)) for frame in coded
-            ),
+            "message": tuple(map(_digest_of, messages)),
         }
         if self._foregrounds:
             masked = zip(made.decoded, frames, self._foregrounds, strict=False)
@@ -191,12 +197,11 @@ class FieldCoder:
 
     def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
         """Return what ``code`` measures; takes and raises the same."""
-        del rate_hz
-        return self._coded(frames, point)[1]
+        return self._coded(frames, rate_hz, point)[1]
 
     def _coded(
-        self, frames: Sequence[I420], point: float
-    ) -> tuple[Sequence[CodedFrame], CodedPictures]:
+        self, frames: Sequence[I420], rate_hz: float, point: float
+    ) -> tuple[Sequence[CodedFrame], CodedPictures, Sequence[bytes]]:
         count = len(self._rendered.views)
         if not 0 < len(frames) <= count:
             raise InvalidInput("frames", f"{len(frames)} are outside the 1..{count} rendered")
@@ -209,9 +214,11 @@ class FieldCoder:
         began_ns = process_time_ns()
         decoded = [picture for _, picture in decode_promised(DeltaDecoder(encoder.header), coded)]
         receiver_cpu_ms = (process_time_ns() - began_ns) / 1e6
-        sizes = [message_bytes(frame.arrival, self._rendered.quality) for frame in coded]
+        writer = MessageWriter(encoder.header, rate_hz, self._rendered.quality)
+        messages = [writer.message(frame.arrival) for frame in coded]
+        sizes = [len(message) for message in messages]
         both_ms = cpu_ms + render_cpu_ms, receiver_cpu_ms + render_cpu_ms
-        return coded, CodedPictures(sizes, decoded, *both_ms)
+        return coded, CodedPictures(sizes, decoded, *both_ms), messages
 
     def _inputs(self, frames: Sequence[I420]) -> Iterator[FrameInput]:
         for index, frame in enumerate(frames):
@@ -219,15 +226,30 @@ class FieldCoder:
             yield FrameInput(frame, self._rendered.views[index], choice)
 
 
-def message_bytes(arrival: Arrival, quality: Quality = FULL) -> int:
-    """Return the size of the whole message that carries the packet from a vehicle."""
-    return len(_message(arrival, quality))
+class MessageWriter:
+    """Makes the whole messages that carry the packets of a clip from a vehicle."""
 
+    def __init__(self, header: StreamHeader, rate_hz: float, quality: Quality = FULL) -> None:
+        self._header, self._rate_hz, self._quality = header, rate_hz, quality
+        self._writer: FrameWriter | None = None
+        self._last: FrameAddress | None = None
 
-def _message(arrival: Arrival, quality: Quality = FULL) -> bytes:
-    pose = arrival.view.camera.world_from_cam
-    message = Frame(MESSAGE_CAMERA, MESSAGE_TIME_NS, pose, b"", arrival.packet, quality)
-    return client_message_to_bytes(message)
+    def message(self, arrival: Arrival, after: int | None = None) -> bytes:
+        """Return the message of a packet, sent after the one of sequence ``after``.
+
+        Without ``after`` that is the one that was written last.
+        """
+        camera, packet = arrival.view.camera, arrival.packet
+        if self._writer is None:
+            front = CameraDescription(CAMERA_ID, camera.intrinsics, self._header, self._rate_hz)
+            self._writer = FrameWriter(Hello(OFFLINE_VEHICLE, (front,), ("0" * 64,), OUR_CONTRACT))
+        time_ns = MESSAGE_TIME_NS + round(1e9 * packet.sequence / self._rate_hz)
+        frame = Frame(CAMERA_ID, time_ns, camera.world_from_cam, "", packet, self._quality)
+        last = self._last
+        if after is not None:
+            last = FrameAddress(CAMERA_ID, packet.epoch, after)
+        self._last = frame.address
+        return self._writer.message(frame, last)
 
 
 def _digest_of(message: bytes) -> str:

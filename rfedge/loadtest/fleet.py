@@ -26,8 +26,9 @@ import grpc
 from rfcore.errors import ProtocolError
 from rfcore.files import write_whole
 from rfcore.wire.conventions import STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import Hello, Welcome
 from rfcore.wire.notices import StreetNotice
 from rfedge.loadtest.grpc_call import GrpcCall, Status
@@ -62,7 +63,8 @@ class PrerecordedVehicle(asyncio.Protocol):
         self.on_notice: Callable[[StreetNotice], None] = lambda _: None
         self._address, self._tls = address, tls
         self._hello = replace(hello, vehicle_id=name)
-        self.replays = [Replay(c.camera_id, drive, wall_ns) for c in hello.cameras]
+        writer = FrameWriter(self._hello)
+        self.replays = [Replay(c.camera_id, drive, wall_ns, writer) for c in hello.cameras]
         self._call = GrpcCall(address, STREAM_METHOD)
         self._transport: asyncio.Transport | None = None
         self._alarm: asyncio.TimerHandle | None = None
@@ -122,7 +124,7 @@ class PrerecordedVehicle(asyncio.Protocol):
         """Say Hello."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        self._call.send(client_message_to_bytes(self._hello))
+        self._call.send(hello_to_bytes(self._hello))
         self._flush()
 
     def data_received(self, data: bytes) -> None:
@@ -172,9 +174,9 @@ class PrerecordedVehicle(asyncio.Protocol):
         for replay in self.replays if self._departed else ():
             if self._is_full or self._call.is_blocked:
                 break
-            frame = replay.frame_to_send(now)
-            if frame is not None:
-                self._call.send(client_message_to_bytes(frame))
+            message = replay.frame_to_send(now)
+            if message is not None:
+                self._call.send(message)
         self._flush()
         if self._departed:
             self._set_alarm()

@@ -24,12 +24,13 @@ from random import Random
 from cav_agent.pipeline import Pipeline
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig
-from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.packet import RECONSTRUCTION_DIGEST_BYTES, RENDER_DIGEST_BYTES, DeltaPacket
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.field import RadianceField
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive, read_drive, write_drive
+from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import (
     Ack,
     CameraDescription,
@@ -98,16 +99,24 @@ NEVER = Schedule(float("inf"), float("inf"), 1.0)
 
 
 class Replay:
-    """Replays ``drive`` as camera ``camera_id``; ``wall_ns`` is the Unix time of a moment."""
+    """Replays ``drive`` as camera ``camera_id`` of the vehicle of ``writer``.
+
+    ``wall_ns`` is the Unix time of a moment.
+    """
 
     def __init__(
-        self, camera_id: str, drive: PrerecordedDrive, wall_ns: Callable[[float], int]
+        self,
+        camera_id: str,
+        drive: PrerecordedDrive,
+        wall_ns: Callable[[float], int],
+        writer: FrameWriter,
     ) -> None:
         self.shots: list[Shot] = []
         self._camera_id = camera_id
         self._drive = drive
         self._schedule = NEVER
         self._wall_ns = wall_ns
+        self._writer = writer
         self._granted = 0
         self._used = 0
         self._waiting: int | None = None
@@ -136,8 +145,8 @@ class Replay:
         due_s = self._schedule.due_s(len(self.shots))
         return None if due_s >= self._schedule.end_s else due_s + self._schedule.ready_s
 
-    def frame_to_send(self, now: float) -> Frame | None:
-        """Return the frame to send now, or None if none is due or has credit."""
+    def frame_to_send(self, now: float) -> bytes | None:
+        """Return the message to send now, or None if none is due or has credit."""
         while (timer := self.get_timer()) is not None and timer <= now:
             if self._waiting is not None:
                 self._drop(self._waiting, now)
@@ -172,7 +181,7 @@ class Replay:
         shot.ended_s, shot.end = now, End.DROPPED
         self._chained = False
 
-    def _sent(self, index: int, now: float) -> Frame:
+    def _sent(self, index: int, now: float) -> bytes:
         shot = self.shots[index]
         shot.sent_s = now
         position = index % len(self._drive.chain)
@@ -181,42 +190,40 @@ class Replay:
             self._sequence = 0
             self._chained = position == 0
         coded = (self._drive.chain if self._chained else self._drive.alone)[position]
+        after = None
+        if self._sequence:
+            after = FrameAddress(self._camera_id, self._epoch, self._sequence - 1)
         frame = Frame(
             self._camera_id,
             self._wall_ns(shot.due_s),
             coded.pose,
-            coded.field_id_prefix,
+            coded.field_id,
             _numbered(coded.packet, self._epoch, self._sequence),
             coded.quality,
         )
         self._sequence += 1
         self._pending[frame.address] = shot, coded.packet.reconstruction_digest
-        return frame
+        return self._writer.message(frame, after)
 
 
 def _numbered(packet: DeltaPacket, epoch: int, sequence: int) -> DeltaPacket:
-    """Return the packet with other numbers and a new CRC.
+    """Return the packet with other numbers.
 
     The fields are written out because ``dataclasses.replace`` takes twice the time.
     """
-
-    def numbered(crc32: int) -> DeltaPacket:
-        return DeltaPacket(
-            epoch,
-            sequence,
-            packet.render_digest,
-            packet.render_block_means,
-            packet.reconstruction_digest,
-            packet.payload,
-            crc32,
-            packet.references,
-            packet.base_digest,
-            packet.photometric,
-            packet.relit,
-            packet.light,
-        )
-
-    return numbered(numbered(0).expected_crc32())
+    return DeltaPacket(
+        epoch,
+        sequence,
+        packet.render_digest,
+        packet.render_block_means,
+        packet.reconstruction_digest,
+        packet.payload,
+        packet.references,
+        packet.base_digest,
+        packet.photometric,
+        packet.relit,
+        packet.light,
+    )
 
 
 CAMERA = "front"
@@ -286,7 +293,7 @@ def _coded(
 def _frame(pipeline: Pipeline, picture: PosedPicture, epoch: int, after: int = -1) -> Frame:
     base = FrameAddress(CAMERA, epoch, after) if after >= 0 else None
     packet = pipeline.encode_picture(picture, epoch, base)
-    return Frame(CAMERA, 0, picture.camera.world_from_cam, b"", packet)
+    return Frame(CAMERA, 0, picture.camera.world_from_cam, "", packet)
 
 
 def payload_drive(field_id: str, size_bytes: int) -> PrerecordedDrive:
@@ -294,10 +301,9 @@ def payload_drive(field_id: str, size_bytes: int) -> PrerecordedDrive:
     intrinsics = Intrinsics(640, 360, 320.0, 320.0, 320.0, 180.0)
     config = CodecConfig(intrinsics.width_px, intrinsics.height_px)
     header = DeltaEncoder(config, time.perf_counter_ns).header
-    digest = bytes(16)
     payload = Random(size_bytes).randbytes(size_bytes)
-    packet = DeltaPacket(0, 0, digest, b"", digest, payload, 0).sealed()
-    frame = Frame(CAMERA, 0, Pose.identity(), b"", packet)
+    digests = bytes(RENDER_DIGEST_BYTES), b"", bytes(RECONSTRUCTION_DIGEST_BYTES)
+    frame = Frame(CAMERA, 0, Pose.identity(), "", DeltaPacket(0, 0, *digests, payload))
     camera = CameraDescription(CAMERA, intrinsics, header)
     return PrerecordedDrive(_hello(camera, field_id), (frame,), (frame,))
 

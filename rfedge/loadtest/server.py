@@ -44,7 +44,7 @@ class PassingDecoder:
         self._grey = I420.filled((camera.intrinsics.width_px, camera.intrinsics.height_px))
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
-        """Return grey; the session has checked the packet's CRC before there was a job."""
+        """Return grey; the frame's CRC was checked when it was read."""
         digest = job.frame.packet.reconstruction_digest
         return Reconstruction(self._grey, digest, StageTimes())
 

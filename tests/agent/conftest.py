@@ -1,6 +1,5 @@
 """A session in a known state, pictures to offer, and packets as an encoder would make them."""
 
-import zlib
 from collections.abc import Callable
 
 import numpy as np
@@ -51,11 +50,10 @@ def encode() -> Callable[[EncodeJob], EncodedFrame]:
         packet = DeltaPacket(
             job.epoch,
             state["sequence"],
-            b"r" * 16,
+            b"rr",
             b"c" * 64,
-            b"d" * 16,
+            b"digest",
             payload,
-            zlib.crc32(payload),
         )
         state["sequence"] += 1
         return EncodedFrame(packet, {"render": 0.01, "encode": 0.02}, Pose.identity())

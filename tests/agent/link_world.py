@@ -50,8 +50,8 @@ class ModelCoder:
             crf = min(51.0, max(LOWEST_CRF, wanted))
         strays = self.random.uniform(-self.spread, self.spread)
         size_bytes = int(most * 2 ** ((LOWEST_CRF - crf) / 6 + strays))
-        digest, payload = b"d" * 16, bytes(size_bytes)
-        packet = DeltaPacket(job.epoch, self.sequences[camera_id], digest, b"", digest, payload, 0)
+        sequence, payload = self.sequences[camera_id], bytes(size_bytes)
+        packet = DeltaPacket(job.epoch, sequence, b"rr", b"", b"digest", payload)
         self.sequences[camera_id] += 1
         return EncodedFrame(packet, {"encode": self.coding_s}, Pose.identity(), crf=crf)
 

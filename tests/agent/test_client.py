@@ -28,6 +28,7 @@ from rfcore.errors import CodecError, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.conventions import TILE, VEHICLE
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
+from rfcore.wire.head import FrameReader
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -51,7 +52,7 @@ def welcoming(message: Hello | Frame) -> list[ServerMessage]:
     if isinstance(message, Hello):
         return [Welcome("s-1", exact=True, rate_hz=5.0), Credit("front", 2)]
     granted = message.address.sequence + 3
-    return [Ack(message.address, StageTimes(), b"d" * 16), Credit("front", granted)]
+    return [Ack(message.address, StageTimes(), b"digest"), Credit("front", granted)]
 
 
 def refusal(
@@ -72,6 +73,10 @@ class MemoryStream:
 
     async def write(self, data: bytes) -> None:
         message = client_message_from_bytes(data)
+        if isinstance(message, Hello):
+            self._reader = FrameReader(message)
+        else:
+            message = self._reader.frame(message)
         self.received.append(message)
         answer = self._answer(message)
         if isinstance(answer, list):
@@ -423,7 +428,7 @@ async def test_a_picture_that_waited_too_long_is_reported_though_nothing_else_ha
     def acking(message: Hello | Frame) -> list[ServerMessage]:
         if isinstance(message, Hello):
             return welcoming(message)
-        return [Ack(message.address, StageTimes(), b"d" * 16)]
+        return [Ack(message.address, StageTimes(), b"digest")]
 
     heard = Heard()
     client = open_client(MemoryServer(acking), heard, take=take, rate_control=RateControl(60.0))

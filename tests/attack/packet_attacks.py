@@ -14,12 +14,13 @@ from pathlib import Path
 
 from attack.target import ROOT, SEED, VEHICLE, Target, all_of, for_ever, stream_of
 from cav_agent.pipeline import Pipeline
+from frames import message_of
 from mec_server.decoding.child import DECODER_NAME
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfcore.wire.conventions import RENDERER_CONTRACT
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 
 ATTACKERS_CRF = 24.0
@@ -40,9 +41,8 @@ def picture(target: Target, cameras: int = 1) -> tuple[Hello, Frame]:
     packet = pipeline.encode_picture(shown)
     named = tuple(CameraDescription(f"c{i}", k, pipeline.header) for i in range(cameras))
     contract = RendererContract(RENDERER_CONTRACT, exact=True)
-    prefix = bytes.fromhex(target.field_id)[:8]
     greeting = Hello(VEHICLE, named, (target.field_id,), contract)
-    return greeting, Frame("c0", 0, shown.camera.world_from_cam, prefix, packet)
+    return greeting, Frame("c0", 0, shown.camera.world_from_cam, "", packet)
 
 
 async def flipped_slices(target: Target) -> None:
@@ -51,13 +51,13 @@ async def flipped_slices(target: Target) -> None:
     rng = random.Random(SEED)
 
     async def messages() -> AsyncIterator[bytes]:
-        yield client_message_to_bytes(greeting)
+        yield hello_to_bytes(greeting)
         for sequence in range(100_000):
             data = bytearray(good.packet.payload)
             data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-            packet = replace(good.packet, epoch=1, sequence=sequence, payload=bytes(data)).sealed()
+            packet = replace(good.packet, epoch=1, sequence=sequence, payload=bytes(data))
             captured_ns = time.time_ns()
-            yield client_message_to_bytes(replace(good, packet=packet, capture_time_ns=captured_ns))
+            yield message_of(greeting, replace(good, packet=packet, capture_time_ns=captured_ns))
             await asyncio.sleep(0.02)
 
     async def stream() -> None:
@@ -72,12 +72,12 @@ async def hung_decoders(target: Target) -> None:
     greeting, good = picture(target, 4)
 
     async def messages() -> AsyncIterator[bytes]:
-        yield client_message_to_bytes(greeting)
+        yield hello_to_bytes(greeting)
         for sequence in range(100_000):
-            packet = replace(good.packet, epoch=1, sequence=sequence).sealed()
+            packet = replace(good.packet, epoch=1, sequence=sequence)
             for camera in greeting.cameras:
                 shown = replace(good, camera_id=camera.camera_id, capture_time_ns=time.time_ns())
-                yield client_message_to_bytes(replace(shown, packet=packet))
+                yield message_of(greeting, replace(shown, packet=packet))
             await asyncio.sleep(0.1)
 
     async def stream() -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import math
 import random
 from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
@@ -17,11 +16,12 @@ from pathlib import Path
 import grpc
 
 from attack.target import SEED, VEHICLE, Target, all_of, for_ever, frame, hello, stream_of
+from frames import far_away, flipped, message_of
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.messages import Hello
 from rfcore.wire.twin import PictureEncoding, Subscription, subscription_to_wire
-from rfcore.wire.v1 import edge_pb2, field_pb2, field_pb2_grpc, twin_pb2_grpc
+from rfcore.wire.v1 import field_pb2, field_pb2_grpc, twin_pb2_grpc
 
 
 async def unread_fetches(target: Target) -> None:
@@ -48,7 +48,7 @@ async def hello_and_wait(target: Target, asked: Hello, wait_s: float) -> None:
     """Say Hello on a connection of its own, and leave after a while."""
     async with target.channel() as channel:
         call = channel.stream_stream(STREAM_METHOD)()
-        await call.write(client_message_to_bytes(asked))
+        await call.write(hello_to_bytes(asked))
         await asyncio.sleep(wait_s)
 
 
@@ -61,7 +61,7 @@ async def decoders_within_budget(target: Target) -> None:
 
 async def hold_stream(target: Target, asked: Hello) -> None:
     """Open a stream that says Hello and nothing more, again when the server has ended it."""
-    data = client_message_to_bytes(asked)
+    data = hello_to_bytes(asked)
 
     async def stream() -> None:
         async with target.channel() as channel:
@@ -75,17 +75,17 @@ async def hold_stream(target: Target, asked: Hello) -> None:
 async def send_for_ever(
     target: Target,
     size: tuple[int, int],
-    message: Callable[[int], bytes],
+    message: Callable[[Hello, int], bytes],
     every_s: float,
     streams: int = 1,
 ) -> None:
     """Send ``message(0)``, ``message(1)``, ... after a Hello on each stream, again when it ends."""
-    greeting = client_message_to_bytes(hello(target, *size))
+    greeting = hello(target, *size)
 
     async def messages() -> AsyncIterator[bytes]:
-        yield greeting
+        yield hello_to_bytes(greeting)
         for number in range(1_000_000):
-            yield message(number)
+            yield message(greeting, number)
             await asyncio.sleep(every_s)
 
     async def stream() -> None:
@@ -98,8 +98,9 @@ async def send_for_ever(
 async def frames_that_cost_a_render(
     target: Target, *, good_crc: bool, size: tuple[int, int]
 ) -> None:
-    def message(number: int) -> bytes:
-        return client_message_to_bytes(frame(number, good_crc=good_crc, payload=b"\x41junk"))
+    def message(greeting: Hello, number: int) -> bytes:
+        data = message_of(greeting, frame(number, b"\x41junk"))
+        return data if good_crc else flipped(data)
 
     await send_for_ever(target, size, message, 0.002, streams=4)
 
@@ -127,7 +128,7 @@ async def greedy_promise_within_budget(target: Target) -> None:
 
 async def cancelled_hellos(target: Target) -> None:
     """Streams that are cancelled right after their Hello."""
-    data = client_message_to_bytes(hello(target, 640, 360, 8))
+    data = hello_to_bytes(hello(target, 640, 360, 8))
 
     async def stream() -> None:
         async with target.channel() as channel:
@@ -144,7 +145,7 @@ async def unread_refusals(target: Target) -> None:
     rng = random.Random(SEED)
 
     async def messages() -> AsyncIterator[bytes]:
-        yield client_message_to_bytes(hello(target, 640, 360))
+        yield hello_to_bytes(hello(target, 640, 360))
         while True:
             yield rng.randbytes(200)
 
@@ -171,9 +172,9 @@ async def unread_watches(target: Target) -> None:
 async def impossible_times(target: Target) -> None:
     """Frames captured at time 0 and at 2^63 - 1."""
 
-    def message(number: int) -> bytes:
+    def message(greeting: Hello, number: int) -> bytes:
         captured_ns = (0, 2**63 - 1)[number % 2]
-        return client_message_to_bytes(frame(number, good_crc=True, captured_ns=captured_ns))
+        return message_of(greeting, frame(number, captured_ns=captured_ns))
 
     await send_for_ever(target, (320, 180), message, 0.02)
 
@@ -223,7 +224,7 @@ async def rapid_resets(target: Target) -> None:
 
 async def foreign_names(target: Target) -> None:
     """Hellos under another vehicle's name."""
-    data = client_message_to_bytes(replace(hello(target, 640, 360), vehicle_id="bystander"))
+    data = hello_to_bytes(replace(hello(target, 640, 360), vehicle_id="bystander"))
 
     async def stream() -> None:
         async with target.channel() as channel:
@@ -238,8 +239,8 @@ async def foreign_names(target: Target) -> None:
 async def refused_frames(target: Target) -> None:
     """Frames of another render, every second one left out: a Nack for each."""
 
-    def message(number: int) -> bytes:
-        return client_message_to_bytes(frame(2 * number + 1, good_crc=True))
+    def message(greeting: Hello, number: int) -> bytes:
+        return message_of(greeting, frame(2 * number + 1))
 
     await send_for_ever(target, (320, 180), message, 0.005)
 
@@ -248,21 +249,16 @@ async def unknown_fields(target: Target) -> None:
     """Messages with 200,000 fields that nobody knows."""
     tag = bytes([0xF8, 0xFF, 0x07, 0x01])  # field 16383, varint 1
     many = tag * 200_000
-    await send_for_ever(target, (320, 180), lambda _: many, 0.005)
+    await send_for_ever(target, (320, 180), lambda *_: many, 0.005)
 
 
 async def odd_numbers(target: Target) -> None:
-    """Poses of NaN, infinity and 1e30 m, sequences of 2^63."""
-    numbers = (math.nan, math.inf, 1e30, 1.0)
+    """Poses 450,000 km away, sequences of 2^63 - 1."""
 
-    def message(number: int) -> bytes:
-        request = edge_pb2.StreamRequest()
-        request.ParseFromString(client_message_to_bytes(frame(number, good_crc=True)))
-        request.frame.pose.x_m = numbers[number % 4]
-        if number % 4 == 3:
-            request.frame.sequence = 1 << 63
-        del request.frame.pose_f32[:]
-        return request.SerializeToString()
+    def message(greeting: Hello, number: int) -> bytes:
+        if number % 2:
+            return far_away(greeting, frame(number), 900_000.0)
+        return message_of(greeting, frame((1 << 63) - 1))
 
     await send_for_ever(target, (320, 180), message, 0.005)
 

@@ -7,7 +7,7 @@ import random
 import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
@@ -83,12 +83,10 @@ def hello(target: Target, width: int, height: int, cameras: int = 1, rate_hz: fl
     return Hello(VEHICLE, named, (target.field_id,), contract)
 
 
-def frame(sequence: int, *, good_crc: bool, payload: bytes = b"", captured_ns: int = 1) -> Frame:
-    packet = DeltaPacket(0, sequence, b"r" * 16, b"", b"d" * 16, payload, 0).sealed()
-    if not good_crc:
-        packet = replace(packet, crc32=packet.crc32 ^ 1)
+def frame(sequence: int, payload: bytes = b"", captured_ns: int = 1000) -> Frame:
     pose = Pose((0.0, 0.0, 1.6), (0.5, -0.5, 0.5, -0.5))
-    return Frame("c0", captured_ns, pose, b"", packet)
+    packet = DeltaPacket(0, sequence, b"rr", b"", b"digest", payload)
+    return Frame("c0", captured_ns, pose, "", packet)
 
 
 async def for_ever(work: Callable[[], Awaitable[object]], pause_s: float = 0.0) -> None:

@@ -18,6 +18,8 @@ from rfcore.codec.sender.encoder import LEFT_TO_THE_ENCODER, DeltaEncoder, Encod
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour
 from rfcore.views import FieldView
+from rfcore.wire.head import FrameWriter
+from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 
 SIZE_PX = (64, 48)
 WALL_M = 10.0
@@ -66,6 +68,20 @@ class SentStream:
 
     header: StreamHeader
     frames: tuple[SentFrame, ...]
+
+
+def sent_frames(stream: SentStream) -> tuple[Hello, list[tuple[bytes, Frame]]]:
+    """Return the Hello of a vehicle that sends the stream, and its frames as they are sent."""
+    intrinsics = stream.frames[0].view.camera.intrinsics
+    camera = CameraDescription("front", intrinsics, stream.header, 10.0)
+    hello = Hello("golden", (camera,), ("ab" * 32,), RendererContract("golden", exact=True))
+    writer, frames, last = FrameWriter(hello), [], None
+    for index, sent in enumerate(stream.frames):
+        pose = sent.view.camera.world_from_cam
+        frame = Frame("front", index * 100_000_000, pose, "", sent.packet)
+        frames.append((writer.data(frame, last), frame))
+        last = frame.address
+    return hello, frames
 
 
 def exchange(
@@ -129,7 +145,7 @@ def _moment(index: int, size_px: tuple[int, int]) -> tuple[I420, FieldView]:
     width, height = size_px
     k = Intrinsics(width, height, width, width, width / 2, height / 2)
     step_m = SHIFT_PX * WALL_M / width
-    pose = Pose((index * step_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    pose = Pose((index * step_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)).rounded()
     depth = np.full((height, width), WALL_M, np.float32)
     x, y = np.meshgrid(np.arange(width) + SHIFT_PX * index, np.arange(height))
     luma = 0.5 + 0.2 * np.sin(x / 5) * np.cos(y / 4) + 0.1 * (np.sin(x / 2) > math.sin(1))

@@ -46,24 +46,22 @@ def psnr_y_db(a: I420, b: I420) -> float:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"epoch": 4, "sequence": 3, "crc32": 0}, RejectReason.STALE_EPOCH),
-        ({"sequence": 9, "crc32": 0}, RejectReason.STALE_SEQUENCE),
-        ({"crc32": 0}, RejectReason.CRC_MISMATCH),
-        ({"render_digest": bytes(16), "crc32": 0}, RejectReason.CRC_MISMATCH),
-        ({"render_digest": bytes(16), "payload": b""}, RejectReason.RENDER_MISMATCH),
-        ({"render_digest": bytes(16), "payload": b"\x65"}, RejectReason.RENDER_MISMATCH),
+        ({"epoch": 4, "sequence": 3, "payload": b""}, RejectReason.STALE_EPOCH),
+        ({"sequence": 9, "payload": b""}, RejectReason.STALE_SEQUENCE),
+        ({"render_digest": bytes(2), "payload": b""}, RejectReason.RENDER_MISMATCH),
+        ({"render_digest": bytes(2), "payload": b"\x65"}, RejectReason.RENDER_MISMATCH),
         (
             {
-                "render_digest": bytes(16),
+                "render_digest": bytes(2),
                 "references": (Reference.PREVIOUS,),
-                "base_digest": b"none",
+                "base_digest": b"nobody",
             },
             RejectReason.RENDER_MISMATCH,
         ),
         ({"payload": b""}, RejectReason.RECONSTRUCTION_MISMATCH),
         ({"payload": b"\x41"}, RejectReason.MALFORMED_PAYLOAD),
         ({"payload": b"\x41\x9a\x22"}, RejectReason.DECODER_FAILED),
-        ({"reconstruction_digest": bytes(16)}, RejectReason.RECONSTRUCTION_MISMATCH),
+        ({"reconstruction_digest": bytes(6)}, RejectReason.RECONSTRUCTION_MISMATCH),
     ],
 )
 def test_the_first_check_that_fails_gives_the_reason(encoder, sent, change, reason):
@@ -72,7 +70,7 @@ def test_the_first_check_that_fails_gives_the_reason(encoder, sent, change, reas
     packet = replace(sent.packet, **change)
     _, render = pair(*SIZE_PX)
     with pytest.raises(PacketRejected) as caught:
-        decoder.decode(state, packet if "crc32" in change else packet.sealed(), render)
+        decoder.decode(state, packet, render)
     assert caught.value.reason == reason
     good = decoder.decode(state, sent.packet, render)
     assert good.frame.digest() == sent.reconstruction.digest()
@@ -82,7 +80,7 @@ def test_the_first_check_that_fails_gives_the_reason(encoder, sent, change, reas
 def test_only_slices_of_predicted_pictures_reach_the_decoder(encoder, sent, nal_type):
     decoder = DeltaDecoder(encoder.header)
     payload = bytes([0x60 | nal_type]) + sent.packet.payload[1:]
-    packet = replace(sent.packet, payload=payload).sealed()
+    packet = replace(sent.packet, payload=payload)
     with pytest.raises(PacketRejected, match=rf"NAL unit type {nal_type} is not a P picture"):
         decoder.decode(decoder.start(5), packet, pair(*SIZE_PX)[1])
 
@@ -92,9 +90,7 @@ def test_a_second_nal_unit_in_the_payload_is_refused(encoder, sent, start_code):
     decoder = DeltaDecoder(encoder.header)
     payload = sent.packet.payload + start_code + encoder.header.sps
     with pytest.raises(PacketRejected, match="start code") as caught:
-        decoder.decode(
-            decoder.start(5), replace(sent.packet, payload=payload).sealed(), pair(*SIZE_PX)[1]
-        )
+        decoder.decode(decoder.start(5), replace(sent.packet, payload=payload), pair(*SIZE_PX)[1])
     assert caught.value.reason == RejectReason.MALFORMED_PAYLOAD
 
 
@@ -158,7 +154,7 @@ def test_a_render_of_another_pose_or_field_is_refused(encoder, sent, exact, wron
 
 def test_an_inexact_receiver_still_checks_what_it_can(encoder, sent):
     decoder = DeltaDecoder(encoder.header, exact=False)
-    packet = replace(sent.packet, reconstruction_digest=bytes(16)).sealed()
+    packet = replace(sent.packet, reconstruction_digest=bytes(6))
     with pytest.raises(PacketRejected, match="another picture than the sender's"):
         decoder.decode(decoder.start(5), packet, pair(*SIZE_PX)[1])
 
@@ -180,8 +176,7 @@ def test_pictures_of_another_size_are_the_callers_mistake(encoder, sent):
     [
         ({"epoch": -1}, "packet.epoch: -1"),
         ({"sequence": 1 << 64}, "packet.sequence"),
-        ({"crc32": 1 << 32}, "packet.crc32"),
-        ({"render_digest": b"short"}, "packet.render_digest: 5 bytes where 16"),
+        ({"render_digest": b"long"}, "packet.render_digest: 4 bytes where 2"),
         ({"render_block_means": b"c"}, "packet.render_block_means: 1 bytes where 0 or 64"),
         ({"reconstruction_digest": bytes(17)}, "packet.reconstruction_digest: 17 bytes"),
     ],

@@ -38,8 +38,8 @@ def test_the_right_field_costs_less_and_shows_more_than_a_wrong_one():
 def test_a_frame_costs_its_slice_and_its_header():
     clip = coded(street(2))
     headers = clip.frame_bytes - np.array(clip.notes["slice_bytes"])
-    assert (headers > 60).all()
-    assert (headers < 300).all()
+    assert (headers > 18).all()
+    assert (headers < 60).all()
 
 
 def test_the_references_are_told_frame_by_frame():

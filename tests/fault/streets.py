@@ -24,7 +24,7 @@ class ShippedStreet(Street):
         """Return what a vehicle would say, with frames that need their renders alone."""
         drive = PrerecordedDrive.read(self.packets)
         frames = [
-            replace(frame, packet=replace(frame.packet, epoch=0, sequence=number).sealed())
+            replace(frame, packet=replace(frame.packet, epoch=0, sequence=number))
             for number, frame in enumerate(drive.alone)
         ]
         return CodedStreet(replace(drive.hello, vehicle_id="cav-raw"), frames)

@@ -17,7 +17,7 @@ import pytest
 
 from live_server import tls_options
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.twin import PictureEncoding, Subscription, subscription_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.certs import Members, certify, write_certificates
@@ -214,7 +214,7 @@ async def test_a_storm_of_connections(site: Any, case: Any, coded: Any) -> None:
             call = channels[number].stream_stream(STREAM_METHOD)(wait_for_ready=True)
             hello = replace(coded.hello, vehicle_id=f"storm-{number}")
             try:
-                await call.write(client_message_to_bytes(hello))
+                await call.write(hello_to_bytes(hello))
                 answer = await call.read()
                 ended = "welcome" if answer is not grpc.aio.EOF else (await call.code()).name
             except grpc.aio.AioRpcError as error:

@@ -18,9 +18,10 @@ from rfcore.field.spz import encode_spz
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import RENDERER_CONTRACT
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
 from rfcore.wire.drive_file import CodedDrive, write_drive
+from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import (
     Ack,
     CameraDescription,
@@ -39,6 +40,7 @@ from rfcore.wire.tile_manifest import (
     write_publication,
 )
 from rfcore.wire.tiles import Area
+from rfcore.wire.v1.edge_pb2 import StreamRequest
 
 CORPUS = Path(__file__).parent / "corpus"
 FIELD_ID = "ab" * 32
@@ -68,8 +70,7 @@ def coded() -> tuple[Hello, list[Frame]]:
         picture = i420_from_rgb(np.full((16, 16, 3), 90 + 40 * number, np.uint8))
         encoded = encoder.encode(state, picture, view, choice=choice)
         state = encoded.state
-        prefix = bytes.fromhex(FIELD_ID)[:8]
-        frames.append(Frame("front", 10**9 + number, pose, prefix, encoded.packet))
+        frames.append(Frame("front", 10**9 + 1000 * number, pose, "", encoded.packet))
     described = CameraDescription("front", camera, encoder.header)
     return Hello(
         "cav-1", (described,), (FIELD_ID,), RendererContract(RENDERER_CONTRACT, True)
@@ -78,14 +79,14 @@ def coded() -> tuple[Hello, list[Frame]]:
 
 def put_wire() -> None:
     hello, frames = coded()
-    messages = [client_message_to_bytes(message) for message in (hello, *frames)]
+    messages = [hello_to_bytes(hello), *FrameWriter(hello).in_order(frames)]
     names = ("hello", "frame-0", "frame-1", "frame-relit")
     for name, data in zip(names, messages, strict=True):
         put("message", name, data)
-    ack = Ack(FrameAddress("front", 1, 0), StageTimes(1, 2, 3), bytes(16))
+    ack = Ack(FrameAddress("front", 1, 0), StageTimes(1, 2, 3), bytes(6))
     put("message", "answers", server_messages_to_bytes([ack])[0])
     for name, frame, data in zip(names[1:], frames, messages[1:], strict=True):
-        put("packet", name, data)
+        put("packet", name, StreamRequest.FromString(data).frame)
         put("slices", name, frame.packet.payload)
     put("session", "drive", b"".join(struct.pack("<H", len(data)) + data for data in messages))
     header = hello.cameras[0].codec

@@ -19,6 +19,7 @@ import pytest
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.pipeline import Pipeline
 from cav_agent.vehicle import Vehicle
+from frames import message_of
 from mec_server.config import RecordSettings, ServerConfig
 from mec_server.reconstruction import OpenCameras, open_cameras
 from mec_server.server import EdgeServer
@@ -31,7 +32,7 @@ from rfcore.image import Rgb, write_png
 from rfcore.perception import contacts
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT, STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import (
     Ack,
@@ -174,11 +175,10 @@ def coded_small_street(street: Street) -> CodedStreet:
     camera = CameraDescription("front", INTRINSICS, pipeline.header)
     contract = RendererContract(RENDERER_CONTRACT, exact=True)
     hello = Hello("cav-raw", (camera,), (street.field_id,), contract, allow_recording=True)
-    prefix = bytes.fromhex(street.field_id)[:8]
     frames = []
     for i, picture in enumerate(pictures):
         packet = pipeline.encode_picture(picture)
-        frames.append(Frame("front", i, picture.camera.world_from_cam, prefix, packet))
+        frames.append(Frame("front", 1000 * i, picture.camera.world_from_cam, "", packet))
     return CodedStreet(hello, frames)
 
 
@@ -250,11 +250,16 @@ class RawVehicle:
     def __init__(self, stream: grpc.aio.StreamStreamCall[bytes, bytes]) -> None:
         self.stream = stream
         self.server: EdgeServer | None = None
+        self._hello: Hello | None = None
 
     async def say(self, message: Hello | Frame | bytes) -> None:
         """Send a message, or bytes that only claim to be one."""
-        data = message if isinstance(message, bytes) else client_message_to_bytes(message)
-        await self.stream.write(data)
+        if isinstance(message, Hello):
+            self._hello, message = message, hello_to_bytes(message)
+        elif isinstance(message, Frame):
+            assert self._hello is not None
+            message = message_of(self._hello, message)
+        await self.stream.write(message)
 
     async def hear(self) -> ServerMessage:
         """Return the next message that is not a Credit."""

@@ -12,11 +12,11 @@ import pytest
 from structlog.testing import capture_logs
 
 import mec_server.server
+from frames import message_of
 from live_server import Files, certificates, channel_to, open_stream, watch_call
 from mec_server.config import IdentityBudget
 from rfcore.camera import Camera
 from rfcore.wire.conventions import STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import Subscription, twin_message_from_wire
 from rfcore.wire.twin_client import TwinClient
@@ -147,7 +147,7 @@ async def test_consumers_see_what_they_are_granted(
         channel_to(server.address, certs("vehicle-cav-raw")) as channel,
     ):
         stream = await open_stream(channel, coded.hello)
-        await stream.write(client_message_to_bytes(coded.frames[0]))
+        await stream.write(message_of(coded.hello, coded.frames[0]))
         await stream.read()
         address = server.address
         assert await first_picture(address, certs("consumer-desk")) == "cav-raw"
@@ -231,7 +231,7 @@ async def test_views_show_what_their_consumer_is_granted(
         channel_to(server.address, certs("vehicle-cav-raw")) as channel,
     ):
         stream = await open_stream(channel, coded.hello)
-        await stream.write(client_message_to_bytes(coded.frames[0]))
+        await stream.write(message_of(coded.hello, coded.frames[0]))
         await stream.read()
         assert await seen_by("operator-op") == ["cav-raw"]
         assert await seen_by("vehicle-cav-raw") == ["cav-raw"]
@@ -331,7 +331,7 @@ async def test_objects_are_told_to_whom_the_tile_and_the_pictures_are_granted(
         channel = channel_to(server.address, certs("vehicle-cav-raw"))
         async with channel:
             stream = await open_stream(channel, coded.hello)
-            await stream.write(client_message_to_bytes(coded.frames[0]))
+            await stream.write(message_of(coded.hello, coded.frames[0]))
             await stream.read()
             assert (await granted.read()).field_id == street.field_id
         assert (await granted.read()).field_id == street.field_id, "once more when it has left"

@@ -6,43 +6,17 @@ from typing import Any
 
 import grpc
 
+from frames import far_away, flipped, message_of
 from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Ack, Frame, Nack
-from rfcore.wire.v1 import edge_pb2 as pb
 
 
-def flipped(frame: Frame, bit: int) -> Frame:
+def flipped_slice(frame: Frame, bit: int) -> Frame:
+    """Return the frame as if its check had been made right after a bit was flipped."""
     payload = bytearray(frame.packet.payload)
     payload[(bit // 8) % len(payload)] ^= 1 << (bit % 8)
     return replace(frame, packet=replace(frame.packet, payload=bytes(payload)))
-
-
-def repaired(frame: Frame) -> Frame:
-    return replace(frame, packet=frame.packet.sealed())
-
-
-def truncated(frame: Frame) -> Frame:
-    packet = frame.packet
-    return replace(
-        frame, packet=replace(packet, payload=packet.payload[: -len(packet.payload) // 2])
-    )
-
-
-def changed(frame: Frame, **fields: float) -> bytes:
-    """Return the frame's bytes with numbers of its pose replaced, unchecked."""
-    request = pb.StreamRequest.FromString(client_message_to_bytes(frame))
-    x_m, y_m, z_m = frame.pose.translation_m
-    w, x, y, z = frame.pose.rotation
-    pose = pb.Pose(
-        x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
-    )
-    request.frame.ClearField("pose_f32")
-    request.frame.pose.CopyFrom(pose)
-    for name, value in fields.items():
-        setattr(request.frame.pose, name, value)
-    return request.SerializeToString()
 
 
 async def test_damaged_packets_are_refused_and_the_next_is_right_again(
@@ -54,14 +28,14 @@ async def test_damaged_packets_are_refused_and_the_next_is_right_again(
     said = [
         (f[0], "ack"),
         (f[0], "stale_sequence"),
-        (flipped(f[1], 100), "crc_mismatch"),
-        (truncated(f[1]), "crc_mismatch"),
+        (flipped(message_of(coded.hello, f[1]), 100), "crc_mismatch"),
+        (flipped(message_of(coded.hello, f[1]), 8 * len(f[1].packet.payload)), "crc_mismatch"),
         (f[1], "ack"),
         (f[2], "ack"),
         (f[1], "stale_sequence"),
         (moved, "render_mismatch"),
-        (changed(f[3], x_m=float("nan")), "invalid_argument"),
-        (changed(f[3], rotation_w=2.0), "invalid_argument"),
+        (far_away(coded.hello, f[3], 900_000.0), "invalid_argument"),
+        (replace(f[3], packet=replace(f[3].packet, sequence=99)), "invalid_argument"),
         (b"\xffgarbage", "invalid_argument"),
         (b"", "invalid_argument"),
         (f[3], "ack"),
@@ -84,7 +58,7 @@ async def test_no_flipped_bit_becomes_a_wrong_picture_even_when_its_crc_was_repa
     for number, bit in enumerate(range(0, 8 * len(coded.frames[0].packet.payload), 997)):
         frame = coded.frames[0]
         frame = replace(frame, packet=replace(frame.packet, epoch=number))
-        answer = await welcomed.ask(repaired(flipped(frame, bit)))
+        answer = await welcomed.ask(flipped_slice(frame, bit))
         if isinstance(answer, Ack):
             assert answer.reconstruction_digest == right
         else:

@@ -17,13 +17,14 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from structlog.testing import capture_logs
 
+from frames import flipped, message_of
 from integration.conftest import random_field
 from live_server import Files, certificates, counted, held, limited, until, watched
 from mec_server.config import AdmissionLimits, IdentityBudget, SessionLimits
 from mec_server.session import MAX_UNUSABLE, DecodeJob
 from rfcore.field import save_field
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.messages import Ack, Frame, Hello, Nack
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
@@ -79,9 +80,9 @@ def large_field(tmp_path: Path) -> tuple[Path, str]:
 async def drives(channel: grpc.aio.Channel, coded: Any) -> None:
     """Expect that the vehicle is served over ``channel``."""
     stream = channel.stream_stream(STREAM_METHOD)()
-    await stream.write(client_message_to_bytes(coded.hello))
+    await stream.write(hello_to_bytes(coded.hello))
     await stream.read()
-    await stream.write(client_message_to_bytes(coded.frames[0]))
+    await stream.write(message_of(coded.hello, coded.frames[0]))
     await stream.read()
     await stream.done_writing()
     with suppress(grpc.aio.AioRpcError):
@@ -247,7 +248,7 @@ async def test_openings_that_fail_again_and_again_make_their_vehicle_wait(
 async def test_streams_of_no_frame_or_of_unusable_ones_make_their_vehicle_wait(
     serve: Any, raw_vehicle: Any, coded: Any, count: int
 ) -> None:
-    damaged = replace(coded.frames[0], packet=replace(coded.frames[0].packet, crc32=1))
+    damaged = flipped(message_of(coded.hello, coded.frames[0]))
 
     async def wasted_stream(server: Any) -> None:
         async with raw_vehicle(server.address) as vehicle:
@@ -295,7 +296,7 @@ async def test_who_sends_what_cannot_be_decoded_is_soon_not_rendered_for(
     """With next to no time for rejected frames, the first one spends it all."""
     spent = IdentityBudget(rejected_workers=1e-6)
     junk = coded.frames[0].packet
-    junk = replace(junk, render_digest=bytes(16), render_block_means=b"").sealed()
+    junk = replace(junk, render_digest=bytes(2), render_block_means=b"")
     async with (
         serve(identity_budget=spent) as server,
         raw_vehicle(server.address) as mallory,
@@ -353,11 +354,11 @@ async def test_frames_of_who_sent_what_cannot_be_decoded_give_way_to_those_of_ot
         threads.append((vehicle_id, threading.current_thread().name.rpartition("_")[0]))
 
     never_made_up_for = IdentityBudget(rejected_workers=1e-6)
-    junk = replace(coded.frames[0].packet, render_digest=bytes(16), render_block_means=b"")
+    junk = replace(coded.frames[0].packet, render_digest=bytes(2), render_block_means=b"")
     async with serve(watched(note), identity_budget=never_made_up_for) as server:
         async with raw_vehicle(server.address) as mallory:
             await mallory.greet(named(coded.hello, "mallory"))
-            bad = replace(coded.frames[0], packet=junk.sealed())
+            bad = replace(coded.frames[0], packet=junk)
             assert await mallory.told(of_camera(bad, "mallory")) == ("render_mismatch", 0)
             good = of_camera(coded.frames[0], "mallory")
             assert await mallory.told(good) == ("ack", 0)
@@ -388,7 +389,7 @@ async def test_answers_that_nobody_reads_end_the_stream(
                 for epoch in itertools.count(1):
                     for _ in range(50):
                         await vehicle.say(b"\xff rubbish")
-                    packet = replace(coded.frames[0].packet, epoch=epoch).sealed()
+                    packet = replace(coded.frames[0].packet, epoch=epoch)
                     await vehicle.say(replace(coded.frames[0], packet=packet))
                     await until(lambda epoch=epoch: acked() == epoch)
 

@@ -35,7 +35,7 @@ from lab.servers.scale import run_scale
 from mec_server.guard import FORWARDED
 from rfcore.errors import RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD, TILE
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tile_manifest import Ground, publish
 from rfcore.wire.tiles import Area
@@ -236,7 +236,7 @@ async def test_over_mutual_tls_envoy_says_who_a_vehicle_is_and_nobody_else_can(
         own = TlsFiles(certs / f"{name}.pem", certs / f"{name}.key", certs / "ca.pem")
         async with grpc.aio.secure_channel(address, own.channel_credentials()) as channel:
             stream = channel.stream_stream(STREAM_METHOD)(metadata=metadata)
-            await stream.write(client_message_to_bytes(coded.hello))
+            await stream.write(hello_to_bytes(coded.hello))
             await stream.done_writing()
             with suppress(grpc.aio.AioRpcError):
                 while await stream.read() is not grpc.aio.EOF:

@@ -187,6 +187,6 @@ async def test_learnt_fields_are_tried_on_vehicles_that_are_not_recorded(
                 await vehicle.greet(hello)
                 assert await vehicle.told(coded.frames[0]) == ("ack", 0)
     assert [view.vehicle_id for view in seen] == ["private"]
-    assert seen[0].digest == coded.frames[0].packet.reconstruction_digest
+    assert seen[0].digest.startswith(coded.frames[0].packet.reconstruction_digest)
     assert left == ["recorded", "private"]
     assert not list(tmp_path.rglob("private"))

@@ -48,8 +48,8 @@ def bare_frame(street: Any, hello: Hello, pose: Pose) -> Frame:
     camera = Camera(intrinsics, pose)
     render = field_view_from_view(street.field.render(camera), camera).render
     digest = render.digest()
-    packet = DeltaPacket(0, 0, digest, b"", digest, b"", 0).sealed()
-    return Frame("front", 0, pose, bytes.fromhex(street.field_id)[:8], packet)
+    packet = DeltaPacket(0, 0, digest[:2], b"", digest[:6], b"")
+    return Frame("front", 0, pose, "", packet)
 
 
 async def heard(vehicle: Any, notices: list[StreetNotice]) -> Ack:

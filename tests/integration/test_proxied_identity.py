@@ -16,7 +16,7 @@ from mec_server.guard import FORWARDED
 from mec_server.server import EdgeServer
 from rfcore.errors import InvalidInput
 from rfcore.wire.conventions import STREAM_METHOD
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2, field_pb2_grpc
@@ -40,7 +40,7 @@ def forwarded(tls: TlsFiles) -> tuple[tuple[str, str], ...]:
 
 async def hello(channel: grpc.aio.Channel, coded: Any, metadata: Any = ()) -> Any:
     stream = channel.stream_stream(STREAM_METHOD)(metadata=metadata)
-    await stream.write(client_message_to_bytes(coded.hello))
+    await stream.write(hello_to_bytes(coded.hello))
     return stream
 
 

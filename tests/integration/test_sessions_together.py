@@ -22,6 +22,7 @@ from rfcore.errors import InvalidInput
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import client_message_from_bytes
+from rfcore.wire.head import FrameReader, FrameRefused
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract, StageTimes
 
 FIELD = "ab" * 32
@@ -76,9 +77,9 @@ class World:
         sequence = self.encoder[1] + 1 if self.encoder[0] == job.epoch else 0
         self.encoder = (job.epoch, sequence)
         payload = f"picture {job.capture.index}".encode()
-        digest = zlib.crc32(payload).to_bytes(16, "big")
-        packet = DeltaPacket(job.epoch, sequence, digest, b"c" * 64, digest, payload, 0)
-        return EncodedFrame(packet.sealed(), {}, Pose.identity())
+        digest = zlib.crc32(payload).to_bytes(6, "big")
+        packet = DeltaPacket(job.epoch, sequence, digest[-2:], b"c" * 64, digest, payload)
+        return EncodedFrame(packet, {}, Pose.identity())
 
     def exchange(self) -> None:
         for outgoing in self.agent.messages_to_send(self.now):
@@ -109,8 +110,13 @@ class World:
 
     def serve(self, data: bytes) -> None:
         try:
-            self.server.receive(client_message_from_bytes(data), self.now)
-        except InvalidInput as error:
+            message = client_message_from_bytes(data)
+            if isinstance(message, Hello):
+                self.reader = FrameReader(message)
+            else:
+                message = self.reader.frame(message)
+            self.server.receive(message, self.now)
+        except (InvalidInput, FrameRefused) as error:
             self.server.refuse(error, self.now)
         while jobs := self.server.jobs_to_start(self.now):
             for job in jobs:

@@ -27,8 +27,8 @@ def hello() -> Hello:
 def make_frame() -> Callable[..., Frame]:
     def make(sequence: int, epoch: int = 0, camera_id: str = "front") -> Frame:
         payload = f"{epoch}/{sequence}".encode()
-        packet = DeltaPacket(epoch, sequence, b"r" * 16, b"c" * 64, b"d" * 16, payload, 0)
-        return Frame(camera_id, 1, Pose.identity(), bytes.fromhex(FIELD)[:8], packet.sealed())
+        packet = DeltaPacket(epoch, sequence, b"rr", b"c" * 64, b"digest", payload)
+        return Frame(camera_id, 1000, Pose.identity(), "", packet)
 
     return make
 

@@ -134,7 +134,7 @@ def test_before_hello_there_are_no_cameras(make_frame: MakeFrame) -> None:
     assert cameras.credits() == []
     assert list(cameras.started()) == []
     assert cameras.position(FrameAddress("front", 0, 0)) == (0, None)
-    with pytest.raises(InvalidInput, match=r"frame\.camera_id: 'front'"):
+    with pytest.raises(InvalidInput, match="frame: came before Welcome"):
         cameras.queue_of(make_frame(0))
 
 

@@ -1,7 +1,5 @@
 """A plain Hello and a plain Frame, for the tests to vary."""
 
-import zlib
-
 import pytest
 
 from rfcore.camera import Intrinsics, Pose
@@ -31,11 +29,10 @@ def frame() -> Frame:
     packet = DeltaPacket(
         epoch=3,
         sequence=41,
-        render_digest=b"r" * 16,
+        render_digest=b"rr",
         render_block_means=b"c" * 64,
-        reconstruction_digest=b"d" * 16,
+        reconstruction_digest=b"digest",
         payload=PAYLOAD,
-        crc32=zlib.crc32(PAYLOAD),
     )
     pose = Pose((1.5, -2.25, 1.6), (0.5, 0.5, -0.5, 0.5))
-    return Frame("front", 1_700_000_000_000_000_000, pose, bytes.fromhex("ab" * 8), packet)
+    return Frame("front", 1_700_000_000_000_000_000, pose, "", packet)

@@ -9,14 +9,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rfcore.errors import InvalidData
-from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.drive_file import MAGIC, CodedDrive, read_drive, write_drive
+from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import Frame, Hello
 
 
 @pytest.fixture
 def drive(hello: Hello, frame: Frame) -> CodedDrive:
-    packets = [replace(frame.packet, sequence=i, payload=b"p" * (i * 90 + 1)) for i in range(4)]
+    packets = [replace(frame.packet, sequence=i, payload=b"p" * (i * 50 + 1)) for i in range(4)]
     return CodedDrive(hello, tuple(replace(frame, packet=packet) for packet in packets))
 
 
@@ -65,15 +66,31 @@ def test_what_is_no_drive_is_refused(tmp_path: Path, content: bytes, named: str)
 
 
 def test_a_frame_of_an_unnamed_camera_is_refused(drive: CodedDrive, tmp_path: Path) -> None:
+    hello, (front,) = drive.hello, drive.hello.cameras
+    more = replace(hello, cameras=(front, replace(front, camera_id="rear")))
     stranger = replace(drive.frames[0], camera_id="rear")
-    write_drive(tmp_path / "a.rfv", CodedDrive(drive.hello, (stranger,)))
-    with pytest.raises(InvalidData, match="message 1 is of a camera"):
+    write_drive(tmp_path / "a.rfv", CodedDrive(hello, ()))
+    message = FrameWriter(more).message(stranger, None)
+    with (tmp_path / "a.rfv").open("ab") as file:
+        file.write(bytes([len(message) & 0x7F | 0x80, len(message) >> 7]) + message)
+    with pytest.raises(InvalidData, match=r"message 1: .*frame.camera: 1 where Hello has 0..0"):
+        read_drive(tmp_path / "a.rfv")
+
+
+def test_a_drive_without_one_of_its_messages_is_refused_after_it(drive, tmp_path):
+    write_drive(tmp_path / "whole.rfv", drive)
+    _, _, third, _ = FrameWriter(drive.hello).in_order(drive.frames)
+    data = (tmp_path / "whole.rfv").read_bytes()
+    at = data.index(third)
+    assert len(third) > 127, "its length takes two bytes"
+    (tmp_path / "a.rfv").write_bytes(data[: at - 2] + data[at + len(third) :])
+    with pytest.raises(InvalidData, match="message 3: unknown_state"):
         read_drive(tmp_path / "a.rfv")
 
 
 def test_a_second_hello_is_refused(drive: CodedDrive, tmp_path: Path) -> None:
     write_drive(tmp_path / "a.rfv", CodedDrive(drive.hello, ()))
-    data = client_message_to_bytes(drive.hello)
+    data = hello_to_bytes(drive.hello)
     with (tmp_path / "a.rfv").open("ab") as file:
         file.write(bytes([len(data) & 0x7F | 0x80, len(data) >> 7]) + data)
     with pytest.raises(InvalidData, match="message 1 is a second Hello"):

@@ -21,7 +21,12 @@ from rfcore.codec.h264.config import (
 )
 from rfcore.codec.h264.qp_map import QpMap, check_qp_map
 from rfcore.codec.h264.splice import SpliceDecoder, without_zeros
-from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket, block_mean_digest
+from rfcore.codec.packet import (
+    RECONSTRUCTION_DIGEST_BYTES,
+    RENDER_DIGEST_BYTES,
+    DeltaPacket,
+    block_mean_digest,
+)
 from rfcore.codec.photometric import Photometric, sent_light
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import (
@@ -233,17 +238,16 @@ class DeltaEncoder:
         packet = DeltaPacket(
             epoch=state.epoch,
             sequence=state.next_sequence,
-            render_digest=render_digest,
+            render_digest=render_digest[:RENDER_DIGEST_BYTES],
             render_block_means=block_mean_digest(view.render) if choice.block_means else b"",
-            reconstruction_digest=past.digest,
+            reconstruction_digest=digest[:RECONSTRUCTION_DIGEST_BYTES],
             payload=made.coded.payload,
-            crc32=0,
             references=plan.references,
             base_digest=_base_digest(state.past) if plan.needs_base else b"",
             photometric=plan.prediction.photometric,
             relit=plan.prediction.is_relit,
             light=plan.prediction.light,
-        ).sealed()
+        )
         stage_ns = {
             "references": chosen_ns - started_ns,
             "encode": encoded_ns - chosen_ns,
@@ -363,7 +367,7 @@ def _may_learn_light(choice: FrameChoice) -> bool:
 
 
 def _base_digest(past: Past | None) -> bytes:
-    return b"" if past is None else past.digest[:BASE_DIGEST_BYTES]
+    return b"" if past is None else past.digest[:RECONSTRUCTION_DIGEST_BYTES]
 
 
 def _require_size(name: str, picture: I420, config: CodecConfig) -> None:

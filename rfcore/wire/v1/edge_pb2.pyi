@@ -37,7 +37,7 @@ class _ReferenceEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Reference.V
     REFERENCE_RENDER: _Reference.ValueType  # 1
     """The field rendered at the frame's pose."""
     REFERENCE_PREVIOUS: _Reference.ValueType  # 2
-    """The earlier frame that base_digest names, as it was decoded."""
+    """The earlier frame that the frame is sent after, as it was decoded."""
     REFERENCE_WARP: _Reference.ValueType  # 3
     """That frame carried to this frame's pose by the field's depth, holes from the render."""
     REFERENCE_CORRECTION: _Reference.ValueType  # 4
@@ -50,7 +50,7 @@ REFERENCE_UNSPECIFIED: Reference.ValueType  # 0
 REFERENCE_RENDER: Reference.ValueType  # 1
 """The field rendered at the frame's pose."""
 REFERENCE_PREVIOUS: Reference.ValueType  # 2
-"""The earlier frame that base_digest names, as it was decoded."""
+"""The earlier frame that the frame is sent after, as it was decoded."""
 REFERENCE_WARP: Reference.ValueType  # 3
 """That frame carried to this frame's pose by the field's depth, holes from the render."""
 REFERENCE_CORRECTION: Reference.ValueType  # 4
@@ -165,15 +165,17 @@ class StreamRequest(_message.Message):
 
     HELLO_FIELD_NUMBER: _builtins.int
     FRAME_FIELD_NUMBER: _builtins.int
+    frame: _builtins.bytes
+    """One picture: a packed head and the slice. `rfcore.wire.head` (in the reference: "Heads of
+    frames") has the layout to the bit, what is implied, and what each check must catch.
+    """
     @_builtins.property
     def hello(self) -> Global___Hello: ...
-    @_builtins.property
-    def frame(self) -> Global___Frame: ...
     def __init__(
         self,
         *,
         hello: Global___Hello | None = ...,
-        frame: Global___Frame | None = ...,
+        frame: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["frame", b"frame", "hello", b"hello", "message", b"message"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
@@ -245,6 +247,7 @@ class Hello(_message.Message):
     RENDERER_FIELD_NUMBER: _builtins.int
     ALLOW_RECORDING_FIELD_NUMBER: _builtins.int
     TAKE_NOTICES_FIELD_NUMBER: _builtins.int
+    LATTICE_FIELD_NUMBER: _builtins.int
     vehicle_id: _builtins.str
     allow_recording: _builtins.bool
     """Whether the server may keep the pictures beyond the newest one."""
@@ -258,6 +261,10 @@ class Hello(_message.Message):
 
     @_builtins.property
     def renderer(self) -> Global___RendererContract: ...
+    @_builtins.property
+    def lattice(self) -> Global___PoseLattice:
+        """What the poses of frames are numbers of."""
+
     def __init__(
         self,
         *,
@@ -267,14 +274,41 @@ class Hello(_message.Message):
         renderer: Global___RendererContract | None = ...,
         allow_recording: _builtins.bool = ...,
         take_notices: _builtins.bool = ...,
+        lattice: Global___PoseLattice | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["renderer", b"renderer"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["lattice", b"lattice", "renderer", b"renderer"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["allow_recording", b"allow_recording", "cameras", b"cameras", "field_ids", b"field_ids", "renderer", b"renderer", "take_notices", b"take_notices", "vehicle_id", b"vehicle_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["allow_recording", b"allow_recording", "cameras", b"cameras", "field_ids", b"field_ids", "lattice", b"lattice", "renderer", b"renderer", "take_notices", b"take_notices", "vehicle_id", b"vehicle_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Hello: _TypeAlias = Hello  # noqa: Y015
+
+@_typing.final
+class PoseLattice(_message.Message):
+    """Poses that frames can have, as whole numbers (rfcore.camera.PoseLattice)."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    STEPS_PER_M_FIELD_NUMBER: _builtins.int
+    ROTATION_STEPS_FIELD_NUMBER: _builtins.int
+    steps_per_m: _builtins.int
+    """Steps of a metre: 2000 are 0.5 mm each."""
+    rotation_steps: _builtins.int
+    """Steps of a quaternion's largest part: with 2^15 a step turns by at most 2^-14 rad."""
+    def __init__(
+        self,
+        *,
+        steps_per_m: _builtins.int = ...,
+        rotation_steps: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["rotation_steps", b"rotation_steps", "steps_per_m", b"steps_per_m"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___PoseLattice: _TypeAlias = PoseLattice  # noqa: Y015
 
 @_typing.final
 class CameraDescription(_message.Message):
@@ -415,9 +449,7 @@ Global___RendererContract: _TypeAlias = RendererContract  # noqa: Y015
 
 @_typing.final
 class Pose(_message.Message):
-    """A rigid transform, of a frame world_from_cam (or world_from_rig) relative to the tile's origin: unit
-    quaternion, translation in metres.
-    """
+    """A rigid transform: unit quaternion, translation in metres."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -491,129 +523,6 @@ class Quality(_message.Message):
 Global___Quality: _TypeAlias = Quality  # noqa: Y015
 
 @_typing.final
-class Frame(_message.Message):
-    """One picture: its pose and the slice that turns the references into it."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    CAMERA_ID_FIELD_NUMBER: _builtins.int
-    EPOCH_FIELD_NUMBER: _builtins.int
-    SEQUENCE_FIELD_NUMBER: _builtins.int
-    CAPTURE_TIME_NS_FIELD_NUMBER: _builtins.int
-    POSE_FIELD_NUMBER: _builtins.int
-    FIELD_ID_PREFIX_FIELD_NUMBER: _builtins.int
-    REFERENCES_FIELD_NUMBER: _builtins.int
-    RENDER_DIGEST_FIELD_NUMBER: _builtins.int
-    RENDER_BLOCK_MEANS_FIELD_NUMBER: _builtins.int
-    RECONSTRUCTION_DIGEST_FIELD_NUMBER: _builtins.int
-    PAYLOAD_FIELD_NUMBER: _builtins.int
-    CRC32_FIELD_NUMBER: _builtins.int
-    BASE_DIGEST_FIELD_NUMBER: _builtins.int
-    PHOTOMETRIC_FIELD_NUMBER: _builtins.int
-    POSE_F32_FIELD_NUMBER: _builtins.int
-    QUALITY_FIELD_NUMBER: _builtins.int
-    INSTANT_FIELD_NUMBER: _builtins.int
-    CAPTURE_CLOCK_FIELD_NUMBER: _builtins.int
-    LOCALISATION_FIELD_NUMBER: _builtins.int
-    RELIT_FIELD_NUMBER: _builtins.int
-    LIGHT_FIELD_NUMBER: _builtins.int
-    camera_id: _builtins.str
-    epoch: _builtins.int
-    """A new epoch starts the state of both ends afresh; sequences count from 0 in it."""
-    sequence: _builtins.int
-    capture_time_ns: _builtins.int
-    field_id_prefix: _builtins.bytes
-    """First 8 bytes of the sha256 of the field; the whole id is in Hello. Empty: its first field."""
-    render_digest: _builtins.bytes
-    """BLAKE2b-128 of the sender's render at the frame's pose."""
-    render_block_means: _builtins.bytes
-    """That render's 8x8 block means, by which a receiver tells rounding from a wrong pose or field;
-    empty between exact renderers, where every difference is refused.
-    """
-    reconstruction_digest: _builtins.bytes
-    """BLAKE2b-128 of the picture that the receiver must end up with."""
-    payload: _builtins.bytes
-    crc32: _builtins.int
-    """CRC-32 (zlib) of everything above that the codec relies on; see rfcore.codec.packet."""
-    base_digest: _builtins.bytes
-    """The first 4 to 16 bytes of the reconstruction_digest of the earlier frame that the references
-    call for; else empty.
-    """
-    instant: _builtins.int
-    """The instant of the rig that the picture belongs to, counted from 1: pictures of the same instant
-    were taken together. 0: the camera stands alone.
-    """
-    capture_clock: Global___CaptureClock.ValueType
-    """For those who look at the twin; nothing is decoded by either."""
-    localisation: Global___Localisation.ValueType
-    relit: _builtins.bool
-    """Whether the render's light is mapped to that of the frame base_digest names, before it is a
-    reference (rfcore.native.warp).
-    """
-    light: _builtins.bytes
-    """The light of a relit frame (rfcore.codec.photometric), at most 1 KiB; empty: that of the frame
-    base_digest names.
-    """
-    @_builtins.property
-    def pose(self) -> Global___Pose:
-        """Either: the pose in float64. Or, in less than half the bytes, pose_f32. Neither: the camera is
-        lost; both ends take a field that shows nothing (grey, no depth) for the field at its pose.
-        """
-
-    @_builtins.property
-    def references(self) -> _containers.RepeatedScalarFieldContainer[Global___Reference.ValueType]:
-        """In the order they are fed to the decoder: the last one is reference 0. Without any, the slice is
-        an I slice; with one and without a payload, that reference is the picture.
-        """
-
-    @_builtins.property
-    def photometric(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
-        """What the render's colours are changed by before it is a reference: nothing, or the 12 numbers
-        of a matrix from Y, Cb, Cr, 1 to Y, Cb, Cr (rfcore.codec.photometric).
-        """
-
-    @_builtins.property
-    def pose_f32(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """x, y, z in metres, rotation w, x, y, z, as in Pose, when float32 holds them exactly."""
-
-    @_builtins.property
-    def quality(self) -> Global___Quality:
-        """How the field was rendered at the frame's pose; absent: with all it has."""
-
-    def __init__(
-        self,
-        *,
-        camera_id: _builtins.str = ...,
-        epoch: _builtins.int = ...,
-        sequence: _builtins.int = ...,
-        capture_time_ns: _builtins.int = ...,
-        pose: Global___Pose | None = ...,
-        field_id_prefix: _builtins.bytes = ...,
-        references: _abc.Iterable[Global___Reference.ValueType] | None = ...,
-        render_digest: _builtins.bytes = ...,
-        render_block_means: _builtins.bytes = ...,
-        reconstruction_digest: _builtins.bytes = ...,
-        payload: _builtins.bytes = ...,
-        crc32: _builtins.int = ...,
-        base_digest: _builtins.bytes = ...,
-        photometric: _abc.Iterable[_builtins.int] | None = ...,
-        pose_f32: _abc.Iterable[_builtins.float] | None = ...,
-        quality: Global___Quality | None = ...,
-        instant: _builtins.int = ...,
-        capture_clock: Global___CaptureClock.ValueType = ...,
-        localisation: Global___Localisation.ValueType = ...,
-        relit: _builtins.bool = ...,
-        light: _builtins.bytes = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose", "quality", b"quality"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "instant", b"instant", "light", b"light", "localisation", b"localisation", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "relit", b"relit", "render_block_means", b"render_block_means", "render_digest", b"render_digest", "sequence", b"sequence"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Frame: _TypeAlias = Frame  # noqa: Y015
-
-@_typing.final
 class Welcome(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -658,6 +567,7 @@ class Ack(_message.Message):
     epoch: _builtins.int
     sequence: _builtins.int
     reconstruction_digest: _builtins.bytes
+    """Of the server's picture, as long as the frame's."""
     @_builtins.property
     def times(self) -> Global___StageTimes: ...
     def __init__(

@@ -38,7 +38,7 @@ from rfcore.metrics import ssim
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView
 from rfedge.evaluate.clips import Drive, luma_mse, psnr_of_mse
-from rfedge.evaluate.field_coder import message_bytes
+from rfedge.evaluate.field_coder import MessageWriter
 from rfedge.offline import CodedFrame, FrameInput, decode_promised, encode_frames
 
 SENDER_STAGES = ("references", "encode", "closed_loop")
@@ -123,7 +123,8 @@ def measure_frames(
         receiver.frame_ended()
         coded.append(frame)
         shown.append(picture)
-    sizes = [message_bytes(frame.arrival, rung.quality) for frame in coded]
+    writer = MessageWriter(encoder.header, drive.name.rate_hz, rung.quality)
+    sizes = [len(writer.message(frame.arrival)) for frame in coded]
     pairs = list(zip(shown, drive.frames, strict=True))[1:]
     mse = float(np.mean([luma_mse(*pair) for pair in pairs]))
     sender_ms = {"convert": rendered.convert_ms, "render": rendered.render_ms, **sender.quartiles()}
