@@ -110,7 +110,7 @@ MUTANTS = (
     Mutant(
         "our frames cost their slices alone",
         "rfedge/evaluate/field_coder.py",
-        "sizes = [message_bytes(frame.arrival, self._rendered.quality) for frame in coded]",
+        "sizes = [len(message) for message in messages]",
         "sizes = [len(frame.encoded.packet.payload) for frame in coded]",
         "tests/evaluate/test_field_coder.py::test_a_frame_costs_its_slice_and_its_header",
     ),
