@@ -176,7 +176,8 @@ def coded_small_street(street: Street) -> CodedStreet:
     contract = RendererContract(RENDERER_CONTRACT, exact=True)
     hello = Hello("cav-raw", (camera,), (street.field_id,), contract, allow_recording=True)
     frames = []
-    for i, picture in enumerate(pictures):
+    for i, taken in enumerate(pictures):
+        picture = replace(taken, camera=taken.camera.rounded())
         packet = pipeline.encode_picture(picture)
         frames.append(Frame("front", 1000 * i, picture.camera.world_from_cam, "", packet))
     return CodedStreet(hello, frames)

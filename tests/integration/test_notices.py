@@ -45,6 +45,7 @@ def as_vehicle(hello: Hello, name: str, *, takes: bool) -> Hello:
 def bare_frame(street: Any, hello: Hello, pose: Pose) -> Frame:
     """A frame that shows the field as it is: its one reference, the render, and no slice."""
     intrinsics: Intrinsics = hello.cameras[0].intrinsics
+    pose = pose.rounded()
     camera = Camera(intrinsics, pose)
     render = field_view_from_view(street.field.render(camera), camera).render
     digest = render.digest()

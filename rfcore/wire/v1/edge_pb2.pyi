@@ -166,7 +166,7 @@ class StreamRequest(_message.Message):
     HELLO_FIELD_NUMBER: _builtins.int
     FRAME_FIELD_NUMBER: _builtins.int
     frame: _builtins.bytes
-    """One picture: a packed head and the slice. `rfcore.wire.head` (in the reference: "Heads of
+    """One picture: a packed head and the slice. `rfcore.wire.head` (File formats: "Heads of
     frames") has the layout to the bit, what is implied, and what each check must catch.
     """
     @_builtins.property
