@@ -28,7 +28,7 @@ from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import Frame
 from rfcore.wire.v1 import edge_pb2 as pb
 from rfedge.arguments import JSON
-from rfedge.report.tables import Column, Parts, Table, columns, print_tables, shown
+from rfedge.report.tables import Column, Table, columns, print_tables, shown
 from rfedge.results import Result, as_json, make_result, provenance, rows_of, write_result
 
 PARTS = ("message", "address", "time", "pose", "references", "fill", "check", "digests", "other")
@@ -126,7 +126,7 @@ def rows(paths: Iterable[Path], before: Mapping[str, tuple[float, float]]) -> It
             yield replace(row, before=before.get(path.stem) if told is drive else None)
 
 
-def _parts(result: Result) -> Parts:
+def _parts(result: Result) -> Iterator[Table | str]:
     found = rows_of(HeadRow, result["rows"])
     before = f"; before: at revision {result['before']}" if result["before"] else ""
     yield Table(f"Bytes of a head, median / 95th percentile{before}", columns(HeadRow), found)

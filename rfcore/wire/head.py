@@ -53,14 +53,14 @@ Bytes of each part, by ``lab/results/head.md`` where usual; at worst of a frame 
 
 *What the checks must catch.* The check is CRC-32 (zlib) of Hello's message, then of every value,
 stated or implied, big-endian: camera (1 byte), epoch (4), sequence, microseconds (8 each), field,
-detail, scale, degree (1 each), samples (2), instant (8), sensing, flags lost and light (1 each),
-pose (7 numbers of 8), references (1), the matrix's numbers (2 each), the digests, the digest of the
-base if it needs one, and everything behind. Nothing is rendered before it was right. It finds every
-burst of 32 bits or less, and of 10**6 damaged messages it lets through 2.3e-4. A frame that was
-let through, or whose check was recomputed, must still end in the promised picture: 48 bits let
-through 3.6e-9 of 10**6. Were all of 10**9 frames decoded wrongly, say by a machine that renders
-otherwise, 3.6e-6 would pass. The 16 bits of the render prove nothing: they say whether the render
-or the slice is to blame, and are wrong about that once in 65,536 such frames.
+detail, scale, degree (1 each), samples (2), instant (8), sensing, the flags from lost on (1 each),
+bytes of a sent light (2), pose (7 numbers of 8), references (1), the matrix's numbers (2 each), the
+digests, the digest of the base if it needs one, and everything behind. Nothing is rendered before
+it was right. It finds every burst of 32 bits or less, and of 10**6 damaged messages it lets through
+2.3e-4. A frame that was let through, or whose check was recomputed, must still end in the promised
+picture: 48 bits let through 3.6e-9 of 10**6. Were all of 10**9 frames decoded wrongly, say by a
+machine that renders otherwise, 3.6e-6 would pass. The 16 bits of the render prove nothing: they say
+whether the render or the slice is to blame, and are wrong about that once in 65,536 such frames.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ _CHECK_BYTES = 4
 _FIELD, _QUALITY, _INSTANT, _SENSING, _LOST, _MEANS = 128, 64, 32, 16, 8, 4
 _PLAIN, _MATRIX, _LEARNT, _SENT = range(4)
 _ALONE, _AFTER_LAST, _AFTER_NAMED = range(3)
-_CHECKED = struct.Struct(">BIQQBBBBHQBB7qB")
+_CHECKED = struct.Struct(">BIQQBBBBHQBBH7qB")
 _NO_POSE = (0,) * 7
 _LONGEST_HEAD_BYTES = 128
 """Longer than any head up to its check, whatever its widths."""
@@ -361,7 +361,10 @@ def _check(stream: int, camera: int, frame: Frame, head: Head) -> int:
         quality.samples_per_ray or 0,
         head.instant,
         head.sensing,
-        _light_kind(packet) | (_LOST if head.pose is None else 0),
+        _light_kind(packet)
+        | (_LOST if head.pose is None else 0)
+        | (_MEANS if packet.render_block_means else 0),
+        len(packet.light),
         *(head.pose or _NO_POSE),
         _CODE_OF[packet.references],
     )

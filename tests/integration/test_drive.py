@@ -31,7 +31,7 @@ async def test_the_server_ends_up_with_the_pictures_of_the_vehicles_closed_loop(
     assert record.counts == {"acked": 6}
     (part,) = recorded_parts(tmp_path, "cav-1", "front")
     assert [picture.file for picture in part.pictures] == [f"{i:06}.png" for i in range(6)]
-    assert [picture.digest for picture in part.pictures] == [
+    assert [picture.digest[:12] for picture in part.pictures] == [
         line["reconstruction_digest"] for line in record.lines
     ]
     driven = read_dataset(street.drive).pictures
@@ -55,7 +55,7 @@ async def test_neither_instruction_set_nor_threads_at_either_end_change_a_byte(
             record = await travel(server.address, render=RenderSettings(agent_threads, agent_isa))
         assert record.counts == {"acked": 6}
         closed_loop = [line["reconstruction_digest"] for line in record.lines]
-        assert [picture.digest for picture in recorded(saved)] == closed_loop
+        assert [picture.digest[:12] for picture in recorded(saved)] == closed_loop
         digests.add(tuple(closed_loop))
     assert len(digests) == 1
 
@@ -73,7 +73,7 @@ async def test_an_opencl_device_at_either_end_changes_no_byte(
     assert record.counts == {"acked": 6}
     for name in ("render_digest", "reconstruction_digest", "server_digest"):
         assert [line[name] for line in record.lines] == [line[name] for line in want.lines]
-    shown = [picture.digest for picture in recorded(tmp_path / "opencl")]
+    shown = [picture.digest[:12] for picture in recorded(tmp_path / "opencl")]
     assert shown == [line["reconstruction_digest"] for line in want.lines]
 
 
@@ -114,7 +114,7 @@ async def test_a_device_removed_under_a_server_costs_no_frame(
             record = await travel(server.address)
     assert record.counts == {"acked": 6}
     assert [line["event"] for line in logs].count("opencl device lost") == 1
-    assert [picture.digest for picture in recorded(tmp_path)] == [
+    assert [picture.digest[:12] for picture in recorded(tmp_path)] == [
         line["reconstruction_digest"] for line in record.lines
     ]
 
@@ -129,7 +129,7 @@ async def test_two_vehicles_share_a_server_and_a_field(
     for name, record in zip(("cav-1", "cav-2"), records, strict=True):
         assert record.counts == {"acked": 6}
         digests = [line["reconstruction_digest"] for line in record.lines]
-        assert [picture.digest for picture in recorded(tmp_path, name)] == digests
+        assert [picture.digest[:12] for picture in recorded(tmp_path, name)] == digests
 
 
 async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_encoded(
@@ -219,6 +219,6 @@ async def test_under_another_light_both_ends_relight_what_they_render(
     assert record.counts == {"acked": 6}
     relit = [line["relit"] for line in record.lines]
     assert relit == [False] + [light is LightChange.AUTO] * 5
-    assert [picture.digest for picture in recorded(tmp_path / "seen")] == [
+    assert [picture.digest[:12] for picture in recorded(tmp_path / "seen")] == [
         line["reconstruction_digest"] for line in record.lines
     ]

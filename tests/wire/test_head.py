@@ -299,8 +299,8 @@ def forged(hello, frame, **parts):
     head = int(bits.ljust(-(-len(bits) // 8) * 8, "0"), 2).to_bytes(-(-len(bits) // 8), "big")
     packet = frame.packet
     behind = packet.render_digest + packet.reconstruction_digest + packet.render_block_means
-    values = [0, packet.epoch, packet.sequence, frame.capture_time_ns // 1000, *[0] * 8]
-    checked = struct.pack(">BIQQBBBBHQBB7qB", *values, x, y, z, *quaternion, 1)
+    values = [0, packet.epoch, packet.sequence, frame.capture_time_ns // 1000, *[0] * 7, 4, 0]
+    checked = struct.pack(">BIQQBBBBHQBBH7qB", *values, x, y, z, *quaternion, 1)
     check = zlib.crc32(hello_to_bytes(hello) + checked + behind + packet.payload)
     return head + check.to_bytes(4, "big") + behind + packet.payload
 
@@ -372,9 +372,20 @@ def test_a_frame_under_another_hello_is_refused(hello, frame):
 # --- damage
 
 
-def test_every_single_flip_of_a_predicted_frame_is_refused(hello, frame):
-    """Time, pose and camera are as covered as the slice."""
-    frames = chain(frame, 4, instant=0)
+@pytest.mark.parametrize(
+    "last",
+    [
+        {},
+        {"render_block_means": bytes(range(64)), "payload": bytes(range(100))},
+        {"relit": True, "light": bytes(range(40)), "payload": bytes(range(100))},
+        {"photometric": tuple(range(12))},
+    ],
+    ids=["plain", "means", "light", "matrix"],
+)
+def test_every_single_flip_of_a_predicted_frame_is_refused(hello, frame, last):
+    """Time, pose and camera are as covered as the slice, and where one part ends."""
+    frames = chain(frame, 4)
+    frames[3] = replace(frames[3], packet=replace(frames[3].packet, **last))
     sent = written(hello, frames)
     for bit in range(8 * len(sent[3])):
         damaged = bytearray(sent[3])
