@@ -33,7 +33,8 @@ MIN_RTT_WINDOW_NS = 10_000_000_000
 """Routes and radio cells change; a shortest round trip older than 10 s is forgotten."""
 
 DELIVERY_SAMPLES = 32
-"""Answers from which the rate is estimated: most of a second at 10 Hz."""
+"""Answers from which the proven rate is taken: three seconds at 10 Hz. Of fewer, a second of small
+frames would forget what larger ones have proven."""
 
 MEAN_MEMORY = 0.7
 """Weight of the running mean so far, when an answer comes."""

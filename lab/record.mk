@@ -18,7 +18,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse lossy-link robust ladder latency compare compare-small)
 	cp $^ lab/results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live cold-start world paper)
 	cp $(filter %.json,$^) lab/results/
 	$(MAKE) -f lab/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
