@@ -38,7 +38,7 @@ class ColdStartRow:
     cache: str
     run: int
     fetched_s: float | None = None
-    """When the field was whole, in seconds of the drive; None: before its first picture."""
+    """When the field became whole, in seconds of the drive; None: before it, or not yet."""
     second: int = 0
     """Seconds since the first picture: the part of the field that is drawn first was there."""
     pictures: int = 0
