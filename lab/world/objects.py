@@ -96,7 +96,7 @@ class AnnotatedDrive:
             camera = picture.camera.rounded()
             view = field.render(camera)
             pictures.append(AnnotatedPicture(camera, time_s, picture.read(), view, vehicles))
-        return AnnotatedDrive(tuple(pictures), FieldGround(field.render))
+        return AnnotatedDrive(tuple(pictures), FieldGround(field.render, field.metadata.vertical))
 
     @property
     def seconds(self) -> float:

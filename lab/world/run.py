@@ -118,7 +118,7 @@ def _gains(
     asked: EvalWorld, field: RadianceField, drive: Drive, truth: SceneTruth, empty: SceneTruth
 ) -> Iterator[Gain]:
     """Yield the gain of each view beside every so-manieth picture of a drive."""
-    ground = FieldGround(field.render)
+    ground = FieldGround(field.render, field.metadata.vertical)
     for index, seen in enumerate(_received(drive, field)):
         if index % asked.every:
             continue
@@ -221,7 +221,7 @@ def cost_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     lives = [live_picture(p.camera, p.read(), field.render(p.camera)) for p in pictures]
     camera = aside(pictures[-1].camera, 1.0)
     rgb, own = pictures[-1].read(), field.render(pictures[-1].camera)
-    ground = FieldGround(field.render)
+    ground = FieldGround(field.render, field.metadata.vertical)
     lives = [cut_out(live, ground)[0] for live in lives]
     times: dict[str, list[float]] = {"render": [], "compose": [], "take up": [], "find": []}
     for _ in range(20):

@@ -165,7 +165,9 @@ class _FieldThread:
 
     def ground(self, field: RadianceField) -> FieldGround:
         """Return the ground of ``field``, with the renders that it has cached."""
-        ground = self._grounds.pop(field.field_id, None) or FieldGround(field.render)
+        ground = self._grounds.pop(field.field_id, None) or FieldGround(
+            field.render, field.metadata.vertical
+        )
         self._grounds[field.field_id] = ground
         if len(self._grounds) > MOST_GROUNDS:
             self._grounds.popitem(last=False)

@@ -17,13 +17,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, TileOrigin
+from rfcore.camera import Camera, Pose, TileOrigin, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive
 from rfcore.field.quality import FULL, Quality
 from rfcore.geodesy import Anchor, anchor_of_values, anchor_values
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import sky_of
+from rfcore.vertical import MOST_SIGHTS, Z_UP, Sight, check_direction
 from rfcore.views import FieldView, View
 
 SPLATS = "splats"
@@ -31,10 +32,11 @@ SPLATS = "splats"
 NGP = "ngp"
 """Multiresolution hash grid with a small network (Mueller et al. 2022)."""
 KINDS = (SPLATS, NGP)
+LATER_KEYS = ("anchor", "up", "sights")
+"""Keys of a header that are left out where nothing is known."""
 LAYER, DELTA = "layer", "delta"
 """Archives that need the splats of their base: ``rfcore.field.layer`` and
 ``rfcore.field.delta``."""
-Vec3 = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,9 @@ class FieldMetadata:
     empty for an imported field. ``held_out_psnr_db`` and ``held_out_ssim`` are means over pictures
     it was not trained on, ``None`` if they were not measured. ``antialiased``: the splats were
     trained to be drawn with an opacity that compensates the screen-space blur. ``anchor``: where on
-    the Earth the field's axes are, ``None`` if that was not stated.
+    the Earth the field's axes are, ``None`` if that was not stated. ``up``: the vertical as the
+    training cameras show it, ``None`` if they were not asked or do not agree; ``sights``: where
+    some of them stood.
     """
 
     name: str = ""
@@ -81,8 +85,14 @@ class FieldMetadata:
     antialiased: bool = False
     kind: str = SPLATS
     anchor: Anchor | None = None
+    up: Vec3 | None = None
+    sights: tuple[Sight, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.up is not None:
+            check_direction("field.up", self.up)
+        if len(self.sights) > MOST_SIGHTS:
+            raise InvalidInput("field.sights", f"{len(self.sights)} are more than {MOST_SIGHTS}")
         if self.kind not in KINDS:
             raise InvalidInput("field.kind", f"'{self.kind}' is none of {', '.join(KINDS)}")
         if self.antialiased and self.kind != SPLATS:
@@ -92,6 +102,18 @@ class FieldMetadata:
             raise InvalidInput("field.held_out_psnr_db", f"{db} must be finite or not given")
         if ssim is not None and not -1 <= ssim <= 1:
             raise InvalidInput("field.held_out_ssim", f"{ssim} is outside -1..1")
+
+    @property
+    def states_up(self) -> bool:
+        """Whether the vertical is known, rather than taken to be z."""
+        return self.up is not None or self.anchor is not None
+
+    @property
+    def vertical(self) -> Vec3:
+        """Up in the field's axes: as the anchor states, else ``up``, else z."""
+        if self.anchor is not None:
+            return Pose((0.0, 0.0, 0.0), self.anchor.enu_from_world).inverse().apply(Z_UP)
+        return self.up or Z_UP
 
 
 class Renderer(Protocol):
@@ -186,9 +208,14 @@ def base_of(archive: Archive) -> str | None:
 def stored_metadata(metadata: FieldMetadata, bounds: Bounds) -> dict[str, Any]:
     """Return a field's metadata as its header stores it."""
     values = asdict(metadata)
-    del values["kind"], values["anchor"]
+    for key in ("kind", *LATER_KEYS):
+        del values[key]
     if metadata.anchor is not None:
         values["anchor"] = anchor_values(metadata.anchor)
+    if metadata.up is not None:
+        values["up"] = list(metadata.up)
+    if metadata.sights:
+        values["sights"] = [[*each.eye_m, *each.towards] for each in metadata.sights]
     return {**values, "bounds": {"low_m": list(bounds.low_m), "high_m": list(bounds.high_m)}}
 
 
@@ -213,6 +240,10 @@ def metadata_of_header(kind: str, stored: Mapping[str, Any]) -> FieldMetadata:
         antialiased=antialiased,
         kind=kind,
         anchor=anchor_of_values(stored["anchor"]) if "anchor" in stored else None,
+        up=_triple(stored["up"]) if "up" in stored else None,
+        sights=tuple(
+            Sight(_triple(values[:3]), _triple(values[3:])) for values in stored.get("sights", ())
+        ),
     )
 
 
@@ -220,12 +251,12 @@ def bounds_of_header(stored: Mapping[str, Any]) -> Bounds | None:
     """Return the bounds in a header, or ``None``; raises as ``metadata_of_header``."""
     if "bounds" not in stored:
         return None
-    return Bounds(_corner(stored["bounds"]["low_m"]), _corner(stored["bounds"]["high_m"]))
+    return Bounds(_triple(stored["bounds"]["low_m"]), _triple(stored["bounds"]["high_m"]))
 
 
-def _corner(values: Any) -> tuple[float, float, float]:
-    east_m, north_m, up_m = (float(value) for value in values)
-    return east_m, north_m, up_m
+def _triple(values: Any) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 def _measured(stored: Mapping[str, Any], key: str) -> float | None:

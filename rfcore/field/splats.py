@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, encode_archive
-from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
+from rfcore.field.interface import LATER_KEYS, SPLATS, Bounds, FieldMetadata, stored_metadata
 from rfcore.field.quality import (
     FULL,
     Beginning,
@@ -135,7 +135,7 @@ class SplatField:
             return SplatField(
                 self.gaussians, metadata, levels=self.levels, threads=self._threads, isa=self.isa
             )
-        kept = {key: value for key, value in old.metadata.items() if key != "anchor"}
+        kept = {key: value for key, value in old.metadata.items() if key not in LATER_KEYS}
         described = {**kept, **stored_metadata(metadata, self.bounds)}
         archive = Archive(SPLATS, described, old.arrays)
         return self._like(self.gaussians, metadata, self.levels, archive)

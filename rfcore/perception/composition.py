@@ -35,7 +35,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose, Vec3
 from rfcore.image import I420, Rgb
 from rfcore.native.live_view import (
     ABSOLUTE_DEPTH_M,
@@ -103,13 +103,13 @@ class Outline:
     """The outline of an object in a picture.
 
     ``box``: rows and columns, ``mask``: bool in them; ``z_m``: depth along the optical axis;
-    ``foot_m``: the point on the tile's ground where it stands.
+    ``foot_m``: where it stands, in the field's axes.
     """
 
     box: tuple[slice, slice]
     mask: Mask
     z_m: float
-    foot_m: tuple[float, float]
+    foot_m: Vec3
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ class LivePicture:
     brightness: float
     things: tuple[StandingPatch, ...] = ()
 
-    def rules_out(self, at_m: tuple[float, float, float], width_m: float, height_m: float) -> bool:
+    def rules_out(self, at_m: Vec3, width_m: float, height_m: float) -> bool:
         """Return whether the picture should show an object with its foot at ``at_m`` and does not.
 
         It should if the foot is in the picture, within ``LOOKED_FOR_M``, and no surface of the

@@ -5,7 +5,7 @@ A pixel is *marked* when it belongs to a change (``rfcore.native.live_view``) an
 more than ``THING_LEVELS``, times the field's ``brightness``. The lowest pixel of a run of marked
 ones in a column is a *contact* with the ground when
 
-* the field's surface just below it is level ground (z is up) within ``REACH_M``,
+* the field's surface just below it is level ground within ``REACH_M``,
 * of the ``LOOKED_AT_M`` above it at least ``LEAST_MARKED_M`` are marked, at its distance: a thing
   may look like what is behind it in the middle, and paint on the road is not tall, and
 * it is not within ``TALL_M`` above something else of its column that is marked so far up, for then
@@ -31,21 +31,25 @@ Its uncertainty across the view is ``ACROSS_PX`` and ``SIDE_M``, since the visib
 the view; along the view it is the length of ``CONTACT_PX`` of ground, which grows with the square
 of the distance over the camera's height. A near side that the picture's edge cuts off is uncertain
 by ``CUT_M``.
+
+All of this is done in the field's upright frame (``rfcore.vertical``); detections are told in the
+field's own axes.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera
+from rfcore.camera import Camera, Vec3
 from rfcore.perception.composition import LivePicture, Outline, with_things
 from rfcore.perception.ground import FieldGround, GroundPlane, points_of, rays_of
+from rfcore.vertical import Z_UP
 
 THING_LEVELS = 22.0
 """On the sample's empty drive nothing is found, nor with 18. With 30, 86 % of the vehicles of
@@ -77,7 +81,6 @@ CONTACT_PX, ACROSS_PX, SIDE_M, CUT_M = 1.0, 2.0, 0.25, 1.5
 LEAST_EYE_M = 0.5
 """Least height of a camera above the foot."""
 
-Vec3 = tuple[float, float, float]
 F64 = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -90,7 +93,7 @@ class Detection:
     ``at_m``: its foot, relative to the tile's origin; ``eye_m``: the camera; ``width_m`` and
     ``height_m``: its size as the camera sees it; ``marked_px``: its marked pixels. The sigmas are
     those of its foot on the ground, along the view and across it. ``trust``: that of the picture
-    (``LivePicture``).
+    (``LivePicture``). ``up``: the field's vertical.
     """
 
     at_m: Vec3
@@ -101,6 +104,7 @@ class Detection:
     along_sigma_m: float
     across_sigma_m: float
     trust: float = 1.0
+    up: Vec3 = Z_UP
 
     @property
     def distance_m(self) -> float:
@@ -145,11 +149,17 @@ def find(picture: LivePicture, ground: FieldGround) -> list[OutlinedDetection]:
     that field's."""
     if picture.trust == 0:
         return []
-    contacts = _contacts(picture, ground)
+    upright = replace(picture, camera=ground.upright(picture.camera))
+    contacts = _contacts(upright, ground)
     found = []
     for thing in _things(contacts):
-        detection = _standing(contacts[thing], picture)
-        if detection is not None:
+        standing = _standing(contacts[thing], upright)
+        if standing is not None:
+            at_m, eye_m = (
+                ground.in_field(standing.at_m),
+                picture.camera.world_from_cam.translation_m,
+            )
+            detection = replace(standing, at_m=at_m, eye_m=eye_m, up=ground.up)
             outline = _outline(picture, contacts[thing], detection)
             found.append(OutlinedDetection(detection, outline))
     return found
@@ -184,7 +194,7 @@ def _outline(picture: LivePicture, thing: Contacts, detection: Detection) -> Out
     row = np.arange(rows.start, rows.stop)[:, None]
     mask = (row >= top) & (row <= foot)
     box = (rows, slice(int(columns[0]), int(columns[-1]) + 1))
-    return Outline(box, mask, z_m, detection.at_m[:2])
+    return Outline(box, mask, z_m, detection.at_m)
 
 
 def _contacts(picture: LivePicture, ground: FieldGround) -> Contacts:

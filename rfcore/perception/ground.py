@@ -11,7 +11,8 @@ Quantiles, 1978; iteratively reweighted least squares). Their median was up to 0
 the sample's field, which is 0.8 m of road at a distance of 16 m; slopes of the ground further away,
 whose depth is too short, were 0.8 % where the street is level.
 
-The places lie on a lattice and are drawn once, for whichever camera comes there first.
+The places lie on a lattice and are drawn once, for whichever camera comes there first. Cameras,
+planes and points are in the field's upright frame (``rfcore.vertical``), in which z is up.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose, Vec3
+from rfcore.vertical import Z_UP, upright_from
 from rfcore.views import View
 
 STEP_M, STEPS = 4.0, 6
@@ -75,18 +77,34 @@ class GroundPlane:
 
 
 class FieldGround:
-    """The ground of one field, drawn by ``render`` where it is asked for."""
+    """The ground of one field, drawn by ``render`` where it is asked for; ``up``: the field's
+    vertical."""
 
-    def __init__(self, render: Callable[[Camera], View]) -> None:
+    def __init__(self, render: Callable[[Camera], View], up: Vec3 = Z_UP) -> None:
         self._render = render
+        self.up = up
+        self._upright_from_field = upright_from(up)
+        self._field_from_upright = self._upright_from_field.inverse()
         self._views: OrderedDict[LatticePoint, F64] = OrderedDict()
 
-    def warm_up(self, at_m: tuple[float, float, float]) -> None:
-        """Draw one place, so that the memory for drawing is there and the next ones are faster."""
-        self._seen(_place_at(*at_m, 0.0))
+    def upright(self, camera: Camera) -> Camera:
+        """Return a camera of the field in its upright frame."""
+        return replace(
+            camera, world_from_cam=self._upright_from_field.compose(camera.world_from_cam)
+        )
+
+    def in_field(self, point_m: Vec3) -> Vec3:
+        """Return a point of the upright frame in the field's axes."""
+        return self._field_from_upright.apply(point_m)
+
+    def warm_up(self, at_m: Vec3) -> None:
+        """Draw the place nearest to a point of the field, so that the memory for drawing is there
+        and the next ones are faster."""
+        self._seen(_place_at(*self._upright_from_field.apply(at_m), 0.0))
 
     def ahead_of(self, camera: Camera) -> GroundPlane | None:
-        """Return the ground ahead of a camera, ``None`` where the field shows too little of it."""
+        """Return the ground ahead of an upright camera, ``None`` where the field shows too little
+        of it."""
         pose = camera.world_from_cam
         x_m, y_m, z_m = pose.translation_m
         forward = np.array(pose.rotation_matrix())[:, 2]
@@ -111,7 +129,9 @@ class FieldGround:
 
     def _drawn(self, place: LatticePoint) -> F64:
         camera, heading_rad = _camera_at(place)
-        view = self._render(camera)
+        view = self._render(
+            replace(camera, world_from_cam=self._field_from_upright.compose(camera.world_from_cam))
+        )
         rows, columns = np.nonzero((view.opacity > OPAQUE) & (view.depth > 0))
         points_m = points_of(camera, rows, columns, view.depth[rows, columns].astype(np.float64))
         away_m = points_m - np.array(camera.world_from_cam.translation_m)

@@ -29,8 +29,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean
 
+from rfcore.camera import Pose, Vec3
 from rfcore.perception.contacts import Detection
 from rfcore.perception.triangulation import Sighting, placed
+from rfcore.vertical import upright_from
 
 GATE_M = 1.5
 GATE_PER_M = 0.1
@@ -52,7 +54,6 @@ LEAST_TRUST = 0.7
 """Pictures of the sample's drive among parked and moving vehicles have 0.77 to 0.91, those at wrong
 poses at most ``composition.MISPLACED_TRUST``."""
 
-Vec3 = tuple[float, float, float]
 CameraKey = tuple[str, str]
 """(vehicle id, camera id)"""
 RulesOut = Callable[[Vec3, float, float], bool]
@@ -206,13 +207,15 @@ class FollowedObject:
         self._remember(_TimedDetection(look.instant, time_s, detection))
         shared = Counter(each.instant for each in self._sightings)
         votes = [1 / shared[each.instant] for each in self._sightings]
+        upright = upright_from(detection.up)
+        field_from_upright = upright.inverse()
         sightings = zip(self._sightings, votes, strict=True)
-        placement = placed([_sighting(each, vote) for each, vote in sightings])
-        self.at_m = (*placement.at_m, self._foot_z_m(votes))
+        placement = placed([_sighting(each, vote, upright) for each, vote in sightings])
+        self.at_m = field_from_upright.apply((*placement.at_m, self._foot_z_m(votes, upright)))
         speed_mps = math.hypot(*placement.velocity_mps)
         slower = min(1.0, MOST_SPEED_MPS / speed_mps) if speed_mps else 1.0
         vx_mps, vy_mps = placement.velocity_mps
-        self.velocity_mps = (slower * vx_mps, slower * vy_mps, 0.0)
+        self.velocity_mps = field_from_upright.apply((slower * vx_mps, slower * vy_mps, 0.0))
         self.width_m, self.height_m = detection.width_m, detection.height_m
         self.cameras[camera] = time_s
 
@@ -236,22 +239,24 @@ class FollowedObject:
         instants = list(dict.fromkeys(each.instant for each in late))[-MOST_REMEMBERED:]
         self._sightings = [each for each in late if each.instant in instants]
 
-    def _foot_z_m(self, votes: Sequence[float]) -> float:
+    def _foot_z_m(self, votes: Sequence[float], upright: Pose) -> float:
         """Return the height of its foot: the mean, weighted as ranges are."""
         seen = zip(self._sightings, votes, strict=True)
         weights = [vote / each.detection.along_sigma_m**2 for each, vote in seen]
-        heights_m = [each.detection.at_m[2] for each in self._sightings]
+        heights_m = [upright.apply(each.detection.at_m)[2] for each in self._sightings]
         return sum(w * z for w, z in zip(weights, heights_m, strict=True)) / sum(weights)
 
 
-def _sighting(seen: _TimedDetection, vote: float) -> Sighting:
-    """Return the sighting on the ground that a detection stands for."""
+def _sighting(seen: _TimedDetection, vote: float, upright: Pose) -> Sighting:
+    """Return the sighting on the ground that a detection stands for; ``upright``: from its field's
+    axes to those of the ground."""
     detection = seen.detection
-    x_m, y_m = (detection.at_m[axis] - detection.eye_m[axis] for axis in (0, 1))
+    at_m, eye_m = upright.apply(detection.at_m), upright.apply(detection.eye_m)
+    x_m, y_m = (at_m[axis] - eye_m[axis] for axis in (0, 1))
     range_m = max(math.hypot(x_m, y_m), LEAST_RANGE_M)
     return Sighting(
         seen.time_s,
-        detection.eye_m[:2],
+        eye_m[:2],
         math.atan2(y_m, x_m),
         detection.across_sigma_m / range_m,
         range_m,

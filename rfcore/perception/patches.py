@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Pose
+from rfcore.camera import Camera, Pose, Vec3
 from rfcore.native.live_view import (
     ABSOLUTE_DEPTH_M,
     COVERED,
@@ -43,14 +43,14 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class StandingPatch:
-    """A patch of an object whose foot is at ``foot_m`` on the tile's ground.
+    """A patch of an object whose foot is at ``foot_m``, in the field's axes.
 
     ``source``: the number of its picture; ``weight``: the picture's weight; ``fade``: 0 to 1, how
     much of it remains visible.
     """
 
     patch: Patch
-    foot_m: tuple[float, float]
+    foot_m: Vec3
     source: int = 0
     weight: float = 1.0
     fade: float = 1.0

@@ -229,10 +229,11 @@ class NgpTrainer(FieldTrainer):
         self.config = config if config is not None else NgpTrainingConfig()
         targets, pictures_digest = load_targets(pictures)
         self._sampler = RaySampler(targets, seed)
-        shape = _shape(self.config.model, [target.camera for target in targets], points)
+        cameras = [target.camera for target in targets]
+        shape = _shape(self.config.model, cameras, points)
         initial, peaks = _start(shape, points, self.config.schedule.threshold, seed)
         digest = _training_digest(pictures_digest, points, self.config, seed)
-        super().__init__(self.config.iterations, digest)
+        super().__init__(self.config.iterations, digest, cameras)
         self._samples_per_ray = FIRST_SAMPLES_PER_RAY
         self._trainable = TrainableNgp(
             initial, peaks, threads=self.config.threads, isa=self.config.isa

@@ -123,12 +123,12 @@ class SplatTrainer(FieldTrainer):
         self._order = view_order(len(self._targets), self._order_rng())
         self._unit_m = float(np.median(np.exp(initial.log_scales.astype(np.float64))))
         digest = _training_digest(pictures_digest, initial, self.config, seed)
-        super().__init__(self.config.iterations, digest)
+        cameras = [target.camera for target in self._targets]
+        super().__init__(self.config.iterations, digest, cameras)
         is_halved = self.config.halved_until > 0
         self._halves = [halved(target) for target in self._targets] if is_halved else []
         self._exposure = ExposureModel(len(self._targets)) if self.config.exposure else None
         self._names = [picture.name for picture in pictures]
-        cameras = [target.camera for target in self._targets]
         self.depth_m = typical_depth_m(initial, cameras)
         self._poses = PoseModel(cameras, self.depth_m) if self.config.refine_poses else None
         self._rasterizer = self._rasterizer_of(initial)

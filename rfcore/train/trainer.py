@@ -20,13 +20,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import TileOrigin
+from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput, TrainingDiverged
 from rfcore.field import FieldMetadata, RadianceField
 from rfcore.field.archive import Archive, decode_archive, encode_archive, read_file
 from rfcore.files import write_whole
 from rfcore.geodesy import Anchor
 from rfcore.metrics import psnr, ssim
+from rfcore.vertical import sights_of, vertical_of
 from rfcore.views import PosedPicture
 
 KIND = "checkpoint"
@@ -123,13 +124,17 @@ class FieldTrainer(ABC):
     kind: ClassVar[str]
     """``splats`` or ``ngp``."""
 
-    def __init__(self, iterations: int, training_digest: str) -> None:
+    def __init__(
+        self, iterations: int, training_digest: str, cameras: Sequence[Camera] = ()
+    ) -> None:
         self.training_digest = training_digest
         self.total = iterations
         """Iterations of the whole run."""
         self.iteration = 0
         """Iterations done so far."""
         self._watch = DivergenceWatch()
+        self._up = vertical_of(camera.world_from_cam for camera in cameras)
+        self._sights = sights_of(cameras)
 
     @property
     def finished(self) -> bool:
@@ -211,6 +216,8 @@ class FieldTrainer(ABC):
             antialiased=antialiased,
             kind=self.kind,
             anchor=anchor,
+            up=self._up,
+            sights=self._sights,
         )
 
 

@@ -97,8 +97,8 @@ class DatasetPoses:
     """COLMAP camera model of the new pictures, where it is not the dataset's camera."""
     parameters: Annotated[tuple[float, ...], arg(metavar="NUMBER ...")] = ()
     """Known parameters of that model in COLMAP's order, which are held; default: estimated."""
-    up: Literal["z", "y", "-y"] = "z"
-    """Which axis is up in the field registered to."""
+    up: Literal["z", "y", "-y"] | None = None
+    """Axis that points up in the field registered to; default: as its training cameras show it."""
     per_second: float = 2.0
     """Pictures to take of each second of a video."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"

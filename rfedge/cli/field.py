@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
@@ -52,6 +52,8 @@ class FieldImport:
     """nerfstudio's dataparser_transforms.json, to bring the field back to its world."""
     tile_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """East, north and up of the tile's origin, m, subtracted in float64."""
+    up: Literal["z", "y", "-y"] | None = None
+    """Axis that points up; default: z."""
     antialiased: bool = False
     """The field was trained with antialiased rasterization (gsplat, Mip-Splatting), and the file's
     SplatRenderMode comment does not say so."""
@@ -70,7 +72,7 @@ class FieldImport:
         from rfcore.errors import InvalidInput
         from rfcore.field import FieldMetadata, SplatField, save_field
         from rfedge.fields.describe import print_levels, size_mb
-        from rfedge.fields.viewpoints import look_around
+        from rfedge.fields.viewpoints import UPS, look_around
 
         out = self.out if self.out is not None else IMPORTED / f"{self.name}.rff"
         _check_out(out, ".rff")
@@ -79,7 +81,8 @@ class FieldImport:
         origin = TileOrigin(*self.tile_origin)
         splats, stated = self._splats(origin)
         antialiased = self.antialiased or stated is True
-        metadata = FieldMetadata(self.name, origin, antialiased=antialiased)
+        up = None if self.up is None else UPS[self.up]
+        metadata = FieldMetadata(self.name, origin, antialiased=antialiased, up=up)
         field = SplatField(splats, metadata, threads=self.threads)
         field = field if self.raw else field.compressed()
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -14,6 +14,7 @@ from rfedge.arguments import ADDRESS, DATASET, FOLDER, TwinConnection, open_driv
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rfcore.camera import Vec3
     from rfcore.field import RadianceField
     from rfedge.twin.scene import TwinScene
     from rfedge.twin.web import Source
@@ -39,6 +40,8 @@ class Twin:
     """End when this process has ended, too."""
     rate_hz: float = 10.0
     """Pictures a second of a drive."""
+    up: Literal["z", "y", "-y"] | None = None
+    """Axis that points up; default: as the field's training cameras show it, else the drive's."""
     threads: int = 1
     """Threads that render a field for comparison."""
     fields: Annotated[Path, FOLDER] = Path("out/twin/fields")
@@ -62,8 +65,22 @@ class Twin:
         if (self.target is None) == (self.connection.nats is None):
             raise InvalidInput("target", "give one: a server, a field, or --nats URL")
         if self.target is None:
-            return self._nats(self.connection.nats or "")
-        return self._server(self.target) if _is_address(self.target) else self._field(self.target)
+            return self._upright(self._nats(self.connection.nats or ""))
+        if _is_address(self.target):
+            return self._upright(self._server(self.target))
+        return self._field(self.target)
+
+    def _upright(
+        self, source: Callable[[TwinScene], Source], otherwise: Vec3 | None = None
+    ) -> Callable[[TwinScene], Source]:
+        """Return ``source`` for a scene whose vertical is that of --up, or ``otherwise``."""
+        from rfedge.fields.viewpoints import UPS
+
+        def upright(scene: TwinScene) -> Source:
+            scene.up = otherwise if self.up is None else UPS[self.up]
+            return source(scene)
+
+        return upright
 
     def _nats(self, urls: str) -> Callable[[TwinScene], Source]:
         from rfedge.twin.nats_source import NatsSource
@@ -84,6 +101,7 @@ class Twin:
 
     def _field(self, target: str) -> Callable[[TwinScene], Source]:
         from rfcore.errors import InvalidInput
+        from rfcore.vertical import vertical_of
         from rfedge.twin.drive_source import DriveSource, FollowedFile
 
         if not 0 < self.rate_hz <= 120:
@@ -92,7 +110,10 @@ class Twin:
         field = opened or FollowedFile(Path(target), self.threads)
         drive = open_drive(self.drive, opened).pictures if self.drive else ()
         name = Path(target).stem
-        return lambda scene: DriveSource(name, field, drive, self.rate_hz, scene)
+        up = None
+        if not isinstance(field, FollowedFile) and not field.metadata.states_up:
+            up = vertical_of(picture.camera.world_from_cam for picture in drive)
+        return self._upright(lambda scene: DriveSource(name, field, drive, self.rate_hz, scene), up)
 
     def _open(self, target: str) -> RadianceField:
         from rfcore.field import FieldMetadata, SplatField, read_splat_file

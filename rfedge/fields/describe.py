@@ -18,7 +18,7 @@ from rich.table import Table
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfcore.field import FULL, Quality, RadianceField, SplatField, render_field_view
+from rfcore.field import FULL, FieldMetadata, Quality, RadianceField, SplatField, render_field_view
 from rfcore.field.interface import SPLATS
 from rfcore.field.quality import DETAILS, kept_of
 from rfcore.field.splat_archive import splats_of_archive
@@ -27,6 +27,7 @@ from rfcore.geodesy import Anchor
 from rfcore.image import I420, Rgb, rgb_from_colour
 from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
+from rfcore.vertical import direction
 from rfcore.views import PosedPicture
 from rfedge.timing import median_ms
 
@@ -133,6 +134,7 @@ def describe_field(field: RadianceField) -> list[tuple[str, str]]:
         ("trained on", m.training_digest or "unknown (imported)"),
         ("tile origin", f"{origin.east_m:g}, {origin.north_m:g}, {origin.up_m:g} m"),
         ("anchor", anchor_text(m.anchor)),
+        ("up", _up(m)),
         ("bounds", f"{_corner(box.low_m)} to {_corner(box.high_m)} m"),
     ]
     if isinstance(field, SplatField):
@@ -144,6 +146,14 @@ def describe_field(field: RadianceField) -> list[tuple[str, str]]:
             ("fitted levels of detail", levels or "none: lower ones are plain prefixes"),
         ]
     return rows
+
+
+def _up(metadata: FieldMetadata) -> str:
+    """Return which way is up, and how that is known."""
+    why = "as nothing else is known"
+    if metadata.states_up:
+        why = "as the training cameras show" if metadata.anchor is None else "by the anchor"
+    return f"{direction(metadata.vertical)}, {why}"
 
 
 def _encoding(field: SplatField) -> str:

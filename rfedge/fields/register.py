@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose, Vec3
 from rfcore.dataset.picture_file import SUFFIXES, picture_size_px, read_picture
 from rfcore.dataset.source import SourceCamera
 from rfcore.dataset.write import WrittenPicture, write_transforms
@@ -27,7 +27,8 @@ from rfcore.files import whole_folder
 from rfcore.image import Rgb
 from rfcore.localise.estimate import PosePrior
 from rfcore.localise.localiser import Localised, Localiser, LocaliserSettings, median_depth
-from rfedge.fields.viewpoints import UPS, looking_at, middle_of
+from rfcore.vertical import direction, upright_from
+from rfedge.fields.viewpoints import UPS, check_up, looking_at, middle_of, vertical
 
 F64 = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -42,15 +43,15 @@ AGAIN_AFTER = 3
 
 @dataclass(frozen=True)
 class RegisterSettings:
-    """The camera of the pictures, and which way is up in the field."""
+    """The camera of the pictures; ``up``: a key of ``UPS``, None for the field's own vertical."""
 
     model: str
     parameters: tuple[float, ...]
-    up: str = "z"
+    up: str | None = None
 
     def __post_init__(self) -> None:
-        if self.up not in UPS:
-            raise InvalidInput("up", f"'{self.up}' is none of {', '.join(UPS)}")
+        if self.up is not None:
+            check_up(self.up)
 
     def intrinsics(self, size_px: tuple[int, int]) -> Intrinsics:
         """Return the camera of pictures of a size; raise ``InvalidInput`` unless it is known."""
@@ -69,7 +70,7 @@ class RegisterSettings:
 class FieldRegistration:
     """Finds picture after picture in one field."""
 
-    def __init__(self, field: RadianceField, intrinsics: Intrinsics, up: str, tell: Tell) -> None:
+    def __init__(self, field: RadianceField, intrinsics: Intrinsics, up: Vec3, tell: Tell) -> None:
         self._field, self._intrinsics, self._up, self._tell = field, intrinsics, up, tell
         self._near = Localiser(field, intrinsics)
         self._anywhere = Localiser(field, intrinsics, LocaliserSettings(most_hypotheses=1))
@@ -102,23 +103,21 @@ class FieldRegistration:
             answer = self._anywhere.localise(rgb, prior)
             if isinstance(answer, Localised):
                 return answer.world_from_cam
-        self._tell(f"not found in the whole field, where {self._up} is taken to be up (--up)")
+        self._tell(f"not found in the whole field, where {direction(self._up)} is up (--up)")
         return None
 
 
-def _grid(field: RadianceField, up_axis: str) -> Iterator[tuple[Pose, float]]:
+def _grid(field: RadianceField, up: Vec3) -> Iterator[tuple[Pose, float]]:
     """Yield poses all over a field, its middle first, and the distance between them, m."""
     middle, radius_m = middle_of(field)
-    up = np.array(UPS[up_axis])
-    east = np.array([1.0, 0.0, 0.0])
-    north = np.cross(up, east)
+    east, north, _ = np.array(upright_from(up).rotation_matrix())
     places = [(a, b) for a in GRID_STEPS for b in GRID_STEPS]
     for a, b in sorted(places, key=lambda place: math.hypot(*place)):
         eye = middle + radius_m * (a * east + b * north)
         for step in range(DIRECTIONS):
             turn = 2 * math.pi * step / DIRECTIONS
             way = math.cos(turn) * east + math.sin(turn) * north
-            yield looking_at(eye, eye + way, up), 0.25 * radius_m
+            yield looking_at(eye, eye + way, np.array(up)), 0.25 * radius_m
 
 
 def register_pictures(
@@ -136,7 +135,8 @@ def register_pictures(
     if size_px is None:
         raise DatasetError(f"{paths[0]}: is no picture whose size can be read")
     intrinsics = settings.intrinsics(size_px)
-    registration = FieldRegistration(field, intrinsics, settings.up, tell)
+    up = vertical(field, settings.up)
+    registration = FieldRegistration(field, intrinsics, up, tell)
     written: list[WrittenPicture] = []
     with whole_folder(out) as folder:
         (folder / "images").mkdir()
@@ -150,8 +150,8 @@ def register_pictures(
                 written.append(WrittenPicture(f"images/{path.name}", camera, world))
         if not written:
             raise DatasetError(
-                f"none of the {len(paths)} pictures was found in the field, where {settings.up} is "
-                f"taken to be up; if another axis is (--up {' or '.join(UPS)}), say so"
+                f"none of the {len(paths)} pictures was found in the field, where {direction(up)} "
+                f"is up; if another axis is (--up {' or '.join(UPS)}), say so"
             )
         write_transforms(folder, written, None, None)
     return _summary(out, paths, written)

@@ -1,6 +1,9 @@
 """A field seen from viewpoints: along a drive, around it, or from its middle.
 
-An orbit and a look around need no given cameras. A field's box reaches as far as its sky; its
+An orbit and a look around need no given cameras. A field says where some of its training cameras
+stood (``Sight``). Where these look at one point, an orbit goes about that, among them: all around
+if they stand all around, else to and fro. Of another field, as of a street, it goes around the
+whole, or to and fro behind cameras that look one way. A field's box reaches as far as its sky; its
 middle is therefore the median of its splats, and its radius the distance that three quarters of
 them lie within.
 """
@@ -13,18 +16,29 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, RadianceField, SplatField
 from rfcore.image import Rgb, rgb_from_colour, write_png
 from rfcore.metrics import psnr
+from rfcore.vertical import Sight, upright_from
 from rfcore.views import PosedPicture
 
 F64 = NDArray[np.float64]
 UPS = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 """Up in ENU, in OpenGL's world, and in the world of OpenCV and most COLMAP models."""
+LEAST_SPREAD, AIMED_RAD, MOST_OFF_RAD = 0.03, math.radians(20), math.radians(60)
+"""Cameras look at one point if their axes differ (least eigenvalue of the normal equations for the
+point, for each camera), half of them aim at it this well, and all of them this badly."""
+GAP_RAD = math.radians(100)
+"""Cameras with a larger gap between them do not stand all around."""
+SWING = 0.5
+"""Share of the cameras' elevations that an orbit to and fro between them goes through."""
+ONE_WAY, BEHIND_RAD = 0.5, math.radians(20)
+"""Length of the mean of the cameras' axes from which they look one way, and how far to both sides
+an orbit goes behind such cameras."""
 FIELD_OF_VIEW_RAD = math.radians(75)
 ELEVATION_RAD = math.radians(25)
 """Height of an orbit above the horizon of its middle."""
@@ -34,44 +48,143 @@ DISTANCE = 1.5
 
 @dataclass(frozen=True)
 class OrbitSettings:
-    """Once around the middle, looking at it from above."""
+    """One turn; ``up``: a key of ``UPS``, None for the field's own vertical."""
 
     frames: int = 96
     width_px: int = 960
     height_px: int = 540
-    up: str = "z"
+    up: str | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= 100_000:
             raise InvalidInput("frames", f"{self.frames} is outside 1..100000")
-        if self.up not in UPS:
-            raise InvalidInput("up", f"'{self.up}' is none of {', '.join(UPS)}")
+        if self.up is not None:
+            check_up(self.up)
+
+
+def check_up(name: str) -> None:
+    """Raise ``InvalidInput`` unless ``name`` is a key of ``UPS``."""
+    if name not in UPS:
+        raise InvalidInput("up", f"'{name}' is none of {', '.join(UPS)}")
+
+
+def vertical(field: RadianceField, up: str | None) -> Vec3:
+    """Return the direction that ``up`` names, or the field's own vertical."""
+    return field.metadata.vertical if up is None else UPS[up]
 
 
 def orbit(field: RadianceField, settings: OrbitSettings) -> list[Camera]:
-    """Return the cameras of one turn around the field."""
-    middle, radius_m = middle_of(field)
-    up = np.array(UPS[settings.up])
-    east, north = _across(up)
+    """Return the cameras of one turn around what the field shows."""
+    up = vertical(field, settings.up)
+    turns_rad = np.linspace(0, 2 * math.pi, settings.frames, endpoint=False)
+    sights = field.metadata.sights
+    middle = seen_point(sights)
+    if middle is not None:
+        offsets = _among(sights, middle, up, turns_rad)
+    else:
+        middle, radius_m = middle_of(field)
+        offsets = DISTANCE * radius_m * _about(sights, up, turns_rad)
     intrinsics = _intrinsics(settings.width_px, settings.height_px)
-    rise, reach = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
-    cameras = []
-    for turn_rad in np.linspace(0, 2 * math.pi, settings.frames, endpoint=False):
-        outward = reach * (math.cos(turn_rad) * east + math.sin(turn_rad) * north) + rise * up
-        eye = middle + DISTANCE * radius_m * outward
-        cameras.append(Camera(intrinsics, looking_at(eye, middle, up)))
-    return cameras
+    return [
+        Camera(intrinsics, looking_at(middle + offset, middle, np.array(up))) for offset in offsets
+    ]
+
+
+def seen_point(sights: Sequence[Sight]) -> F64 | None:
+    """Return the point that cameras look at, None where there is none: nearest to all axes."""
+    if len(sights) < 3:
+        return None
+    eyes, axes = _arrays(sights)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(axis=0)
+    if np.linalg.eigvalsh(normal)[0] < LEAST_SPREAD * len(sights):
+        return None
+    point = np.linalg.solve(normal, (across @ eyes[:, :, None]).sum(axis=0)[:, 0])
+    cosines = _cosines(sights, point)
+    aimed = np.median(cosines) > math.cos(AIMED_RAD) and cosines.min() > math.cos(MOST_OFF_RAD)
+    return np.asarray(point) if aimed else None
+
+
+def first_sight(sights: Sequence[Sight]) -> Sight | None:
+    """Return where to begin to look at a field: at the camera that aims best at what all look at,
+    else at the middle one; None without any."""
+    point = seen_point(sights)
+    if point is not None:
+        return sights[int(np.argmax(_cosines(sights, point)))]
+    return sights[len(sights) // 2] if sights else None
+
+
+def _arrays(sights: Sequence[Sight]) -> tuple[F64, F64]:
+    """Return places and axes, [N, 3] each."""
+    return np.array([s.eye_m for s in sights]), np.array([s.towards for s in sights])
+
+
+def _cosines(sights: Sequence[Sight], point: F64) -> F64:
+    """Return the cosines [N] of the angles between the cameras' axes and the ways to a point."""
+    eyes, axes = _arrays(sights)
+    ways = point - eyes
+    return np.asarray((ways * axes).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9))
+
+
+def _among(sights: Sequence[Sight], middle: F64, up: Vec3, turns_rad: F64) -> F64:
+    """Return offsets [N, 3] from what cameras look at, at their distance and between them."""
+    offsets = _upright([sight.eye_m for sight in sights] - middle, up)
+    ranges_m = np.linalg.norm(offsets, axis=1)
+    elevations_rad = np.arcsin(offsets[:, 2] / np.maximum(ranges_m, 1e-9))
+    azimuths_rad = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
+    gaps_rad = np.diff(azimuths_rad, append=azimuths_rad[0] + 2 * math.pi)
+    last = int(np.argmax(gaps_rad))
+    level_rad = np.full(len(turns_rad), np.median(elevations_rad))
+    if gaps_rad[last] < GAP_RAD:
+        towards = _turned(azimuths_rad[0] + turns_rad, level_rad, up)
+    else:
+        half_rad = math.pi - gaps_rad[last] / 2
+        rise_rad = SWING * float(np.ptp(elevations_rad)) / 2
+        middle_rad = azimuths_rad[last] - half_rad, float(elevations_rad.mean())
+        towards = _to_and_fro(middle_rad, (half_rad, rise_rad), up, turns_rad)
+    return np.asarray(np.median(ranges_m) * towards)
+
+
+def _about(sights: Sequence[Sight], up: Vec3, turns_rad: F64) -> F64:
+    """Return unit vectors [N, 3] towards the places of an orbit around a whole field: from all
+    sides, or from behind cameras that all look one way, for nothing shows what is behind them."""
+    ahead = _upright([sight.towards for sight in sights] or np.zeros((1, 3)), up).mean(axis=0)
+    if np.linalg.norm(ahead) < ONE_WAY:
+        return _turned(turns_rad, np.full(len(turns_rad), ELEVATION_RAD), up)
+    middle_rad = math.atan2(-ahead[1], -ahead[0]), ELEVATION_RAD
+    return _to_and_fro(middle_rad, (BEHIND_RAD, ELEVATION_RAD / 2), up, turns_rad)
+
+
+def _to_and_fro(
+    middle_rad: tuple[float, float], half_rad: tuple[float, float], up: Vec3, turns_rad: F64
+) -> F64:
+    """Return unit vectors [N, 3] on an ellipse; ``middle_rad`` and ``half_rad``: azimuth and
+    elevation of its middle, and its half axes."""
+    azimuths_rad = middle_rad[0] - half_rad[0] * np.cos(turns_rad)
+    return _turned(azimuths_rad, middle_rad[1] + half_rad[1] * np.sin(turns_rad), up)
+
+
+def _upright(vectors: ArrayLike, up: Vec3) -> F64:
+    """Return vectors [N, 3] of the field's axes in the upright frame."""
+    return np.asarray(np.array(vectors) @ np.array(upright_from(up).rotation_matrix()).T)
+
+
+def _turned(azimuths_rad: F64, elevations_rad: F64, up: Vec3) -> F64:
+    """Return unit vectors [N, 3] of directions in the upright frame, in the field's axes."""
+    level = np.cos(elevations_rad)
+    upright = level * np.cos(azimuths_rad), level * np.sin(azimuths_rad), np.sin(elevations_rad)
+    return np.asarray(np.stack(upright, axis=1) @ np.array(upright_from(up).rotation_matrix()))
 
 
 def look_around(field: RadianceField, width_px: int, height_px: int) -> list[Camera]:
-    """Return four cameras in the middle of the field, a quarter turn apart, z being up."""
+    """Return four cameras in the middle of the field, level, a quarter turn apart."""
     middle, radius_m = middle_of(field)
-    up = np.array(UPS["z"])
-    east, north = _across(up)
+    up = field.metadata.vertical
     intrinsics = _intrinsics(width_px, height_px)
+    quarters = np.arange(4) * math.pi / 2
     return [
-        Camera(intrinsics, looking_at(middle, middle + radius_m * way, up))
-        for way in (east, north, -east, -north)
+        Camera(intrinsics, looking_at(middle, middle + radius_m * way, np.array(up)))
+        for way in _turned(quarters, np.zeros(4), up)
     ]
 
 
@@ -99,12 +212,6 @@ def middle_of(field: RadianceField) -> tuple[F64, float]:
         low, high = np.array(field.bounds.low_m), np.array(field.bounds.high_m)
         middle, radius_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     return middle, max(radius_m, 1e-3)
-
-
-def _across(up: F64) -> tuple[F64, F64]:
-    """Return two directions that make a right-handed frame with ``up``."""
-    east = np.array([1.0, 0.0, 0.0])
-    return east, np.cross(up, east)
 
 
 @dataclass(frozen=True)

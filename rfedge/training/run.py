@@ -36,6 +36,7 @@ from rfcore.train.poses import PoseCorrection, align_pictures
 from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.train.start import random_points
 from rfcore.train.trainer import FieldTrainer, HeldOut, held_out_quality, mean_psnr_db
+from rfcore.vertical import Z_UP, direction, vertical_of
 from rfcore.views import PosedPicture
 from rfedge.arguments import time_text
 from rfedge.results import make_result, provenance
@@ -305,6 +306,12 @@ def _announce(job: TrainingJob, console: Console) -> None:
     )
     for change in job.dataset.changes:
         console.print(f"  {change}", highlight=False)
+    if job.dataset.anchor is None:
+        up = vertical_of(picture.camera.world_from_cam for picture in pictures)
+        if up is None:
+            console.print("  the cameras do not agree which way is up: z is taken")
+        elif up != Z_UP:
+            console.print(f"  up is {direction(up)}, as the cameras show")
     check_memory(needed, available_bytes())
     console.print("  reading the pictures")
 

@@ -8,16 +8,18 @@ field's tile origin, so that they are small enough for the browser's float32.
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rfcore.camera import TileOrigin
+from rfcore.camera import TileOrigin, Vec3
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.spz import encode_spz
 from rfcore.perception.objects import CameraKey, StreetObject
 from rfcore.wire.twin import NewestQueue, TwinPicture
+from rfedge.fields.viewpoints import first_sight
 
 CONNECTION, FIELDS, TILES = ("connection",), ("fields",), ("tiles",)
 
@@ -119,6 +121,8 @@ class TwinScene:
         self._newest: dict[CameraKey, TwinPicture] = {}
         self._origin: TileOrigin | None = None
         self._tiles: Mapping[str, Any] = {}
+        self.up: Vec3 | None = None
+        """Up, where it is not to be taken from the fields."""
 
     @property
     def newest(self) -> Mapping[CameraKey, TwinPicture]:
@@ -237,7 +241,8 @@ class TwinScene:
         self._board.post(FIELDS, Message(header, now_s))
 
     def _described(self, placed: PlacedField) -> dict[str, Any]:
-        field = placed.field
+        field, sights = placed.field, placed.field.metadata.sights
+        start = first_sight(sights)
         return {
             "field": field.field_id,
             "tile": placed.tile,
@@ -249,6 +254,11 @@ class TwinScene:
             "origin_m": self._offset_m(field.field_id),
             "low_m": field.bounds.low_m,
             "high_m": field.bounds.high_m,
+            "up": self.up or field.metadata.vertical,
+            "start": start and asdict(start),
+            "apart_m": max(
+                (math.dist(sight.eye_m, sights[0].eye_m) for sight in sights), default=0
+            ),
         }
 
     def _offset_m(self, field_id: str) -> tuple[float, float, float]:

@@ -1,5 +1,7 @@
 """A field keeps its parameters and metadata through a file; damage is one clear error."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,9 @@ from rfcore.field import FieldMetadata, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.interface import Bounds
 from rfcore.field.quality import FULL, Quality
+from rfcore.field.store import decode_field
 from rfcore.raster.gaussians import Gaussians
+from rfcore.vertical import Sight
 from tests.field.some import make_gaussians
 
 METADATA = FieldMetadata(
@@ -28,6 +32,34 @@ def test_a_field_survives_its_file(tmp_path, n, sh_degree):
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(back.gaussians, name), getattr(field.gaussians, name))
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_the_vertical_and_the_sights_of_its_cameras_survive_the_file(tmp_path):
+    sights = (Sight((1.5, -2.0, 0.25), (0.6, 0.0, 0.8)), Sight((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    stated = replace(METADATA, up=(0.0, -1.0, 0.0), sights=sights)
+    save_field(SplatField(make_gaussians(), stated).compressed(), tmp_path / "a.rff")
+    back = load_field(tmp_path / "a.rff")
+    assert back.metadata == stated
+    assert isinstance(back, SplatField)
+    assert back.described(METADATA).archive().metadata.keys() == (
+        SplatField(make_gaussians(), METADATA).compressed().archive().metadata.keys()
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("up", [0, 0, 2]),
+        ("up", [0, 1]),
+        ("sights", [[0] * 6]),
+        ("sights", [[0, 0, 0, 0, 0, 1]] * 65),
+    ],
+)
+def test_a_vertical_or_sight_that_is_none_is_refused(key, value):
+    archive = SplatField(make_gaussians(), METADATA).archive()
+    broken = Archive(archive.kind, {**archive.metadata, key: value}, archive.arrays)
+    with pytest.raises(FieldFormatError):
+        decode_field(encode_archive(broken))
 
 
 def test_a_field_with_other_threads_shares_the_numbers():

@@ -3,10 +3,20 @@
 import numpy as np
 import pytest
 
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from rfcore.field import SplatField
+from rfcore.field import FieldMetadata, SplatField
 from rfcore.raster.gaussians import Gaussians
-from rfedge.fields.viewpoints import UPS, OrbitSettings, look_around, looking_at, orbit
+from rfcore.vertical import Z_UP, Sight, sights_of
+from rfedge.fields.viewpoints import (
+    UPS,
+    OrbitSettings,
+    first_sight,
+    look_around,
+    looking_at,
+    orbit,
+    seen_point,
+)
 
 
 @pytest.mark.parametrize("up", sorted(UPS))
@@ -20,6 +30,79 @@ def test_an_orbit_keeps_the_middle_in_the_middle_and_up_upright(place, up):
         assert depth_m > 0
         _, above_px, _ = camera.project((middle + 0.1 * np.array(UPS[up])).tolist())
         assert above_px < v_px, "what is higher is higher in the picture"
+
+
+OBJECT_M = np.array([2.0, -3.0, 1.0])
+
+
+def photographed(azimuths_deg, turn: Pose) -> SplatField:
+    """A field of one splat that was photographed from these sides, 4 m away and from 1 m above."""
+    sights = []
+    for azimuth in np.radians(azimuths_deg):
+        eye = OBJECT_M + np.array([4 * np.cos(azimuth), 4 * np.sin(azimuth), 1.0])
+        pose = turn.compose(looking_at(eye, OBJECT_M + 0.05, np.array(Z_UP)))
+        sights.append(Camera(Intrinsics(8, 8, 8.0, 8.0, 4.0, 4.0), pose))
+    nothing = Gaussians(*(np.zeros((0, *s), "f4") for s in ((3,), (4,), (3,), (), (1, 3))))
+    return SplatField(nothing, FieldMetadata(up=rotated(turn, Z_UP), sights=sights_of(sights)))
+
+
+def rotated(turn: Pose, vector):
+    return Pose((0.0, 0.0, 0.0), turn.rotation).apply(vector)
+
+
+ASKEW = Pose((3.0, -7.0, 2.0), (0.1, -0.7, 0.5, 0.5))
+
+
+@pytest.mark.parametrize("turn", [Pose.identity(), ASKEW], ids=["z up", "askew"])
+def test_an_orbit_of_an_object_stays_where_it_was_photographed_from(turn):
+    """From a quarter of its sides: to and fro between them."""
+    field = photographed(np.linspace(-45, 45, 9), turn)
+    for camera in orbit(field, OrbitSettings(frames=12, width_px=64, height_px=48)):
+        u_px, v_px, depth_m = camera.project(turn.apply(OBJECT_M))
+        assert (u_px, v_px) == pytest.approx((32, 24), abs=2)
+        assert depth_m == pytest.approx(np.hypot(4, 1), abs=0.2)
+        x_m, y_m, z_m = np.subtract(
+            turn.inverse().apply(camera.world_from_cam.translation_m), OBJECT_M
+        )
+        assert abs(np.degrees(np.arctan2(y_m, x_m))) < 48
+        assert z_m == pytest.approx(1.0, abs=0.1)
+
+
+def test_an_orbit_of_an_object_photographed_all_around_goes_all_around():
+    field = photographed(np.arange(0, 360, 45), Pose.identity())
+    eyes = [c.world_from_cam.translation_m for c in orbit(field, OrbitSettings(frames=8))]
+    sides = np.degrees([np.arctan2(y + 3, x - 2) for x, y, _ in eyes])
+    np.testing.assert_allclose(np.diff(np.sort(sides)), 45, atol=3)
+
+
+def test_a_street_has_no_point_that_its_cameras_look_at():
+    """Neither on the way ahead, nor there and back, nor at a turn."""
+    ahead = [Sight((float(x), 0.0, 1.5), (1.0, 0.0, 0.0)) for x in range(8)]
+    back = [Sight(sight.eye_m, (-1.0, 0.0, 0.0)) for sight in ahead]
+    turn = [
+        Sight((np.sin(a), -np.cos(a), 1.5), (np.cos(a), np.sin(a), 0.0)) for a in (0.0, 0.5, 1.0)
+    ]
+    for sights in (ahead, ahead + back, turn, ahead[:2]):
+        assert seen_point(sights) is None
+
+
+def test_a_field_is_first_seen_by_the_camera_that_aims_best_or_by_the_middle_one():
+    sights = list(photographed(np.linspace(-45, 45, 8), Pose.identity()).metadata.sights)
+    aside = Sight(sights[4].eye_m, (-0.8, 0.6, 0.0))
+    sights.insert(4, aside)
+    assert seen_point(sights) is not None
+    assert first_sight(sights) not in (aside, None)
+    ahead = [Sight((float(x), 0.0, 1.5), (1.0, 0.0, 0.0)) for x in range(5)]
+    assert first_sight(ahead) == ahead[2]
+    assert first_sight([]) is None
+
+
+def test_an_orbit_stays_behind_cameras_that_all_look_one_way(place):
+    way = rotated(ASKEW, (1.0, 0.0, 0.0))
+    metadata = FieldMetadata(up=rotated(ASKEW, Z_UP), sights=(Sight((0.0, 0.0, 0.0), way),) * 4)
+    cameras = orbit(place.field.described(metadata), OrbitSettings(frames=8))
+    ahead = [np.array(c.world_from_cam.rotation_matrix())[:, 2] @ way for c in cameras]
+    assert min(ahead) > 0.7
 
 
 def test_four_cameras_look_around_from_the_middle(place):

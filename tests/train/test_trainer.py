@@ -1,16 +1,18 @@
 """What trainers of every kind share: counting, divergence, metadata, settings of the digest."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from rfcore.camera import TileOrigin
+from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.field import FieldMetadata
 from rfcore.train.ngp import NgpTrainingConfig
 from rfcore.train.splats import SplatTrainingConfig
 from rfcore.train.trainer import Checkpoint, FieldTrainer, HeldOut, settings_of
+from rfcore.vertical import Sight
 
 DIGEST = "ab" * 32
 
@@ -27,8 +29,8 @@ class Scripted(FieldTrainer):
     kind = "splats"
     primitives = 3
 
-    def __init__(self, losses: list[float]) -> None:
-        super().__init__(len(losses), DIGEST)
+    def __init__(self, losses: list[float], cameras: Sequence[Camera] = ()) -> None:
+        super().__init__(len(losses), DIGEST, cameras)
         self.losses = losses
         self.descended: list[float] = []
         self.after: list[tuple[int, float]] = []
@@ -103,6 +105,13 @@ def test_metadata_states_the_run_and_what_was_measured():
         "street", origin, DIGEST, 27.0, 0.8, antialiased=True
     )
     assert trainer.field() == FieldMetadata(training_digest=DIGEST, antialiased=True)
+
+
+def test_metadata_states_which_way_was_up_for_the_cameras_and_where_they_stood():
+    level = Camera(Intrinsics(8, 6, 8.0, 8.0, 4.0, 3.0), Pose.identity())
+    metadata = Scripted([0.4], [level]).field()
+    assert metadata.up == (0.0, -1.0, 0.0)
+    assert metadata.sights == (Sight((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),)
 
 
 @pytest.mark.parametrize("config", [SplatTrainingConfig(), NgpTrainingConfig()])

@@ -5,9 +5,9 @@ import base64
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -18,18 +18,20 @@ from selenium.webdriver.chrome.service import Service as Driver
 from selenium.webdriver.common.keys import Keys
 
 from rfcore.dataset import read_dataset
-from rfcore.field import SplatField, load_field, save_field
+from rfcore.field import FieldMetadata, SplatField, load_field, save_field
 from rfcore.field.importance import most_important_first, reordered, visible_area
 from rfcore.image import rgb_from_bytes
 from rfcore.metrics import ssim
+from rfcore.vertical import Sight
 from rfcore.wire.address import Address
 from rfcore.wire.tiles import LearntLight, Tile, TileLight
 from rfedge.processes import command_of, service
 from rfedge.samples import sample_path
 from rfedge.twin.comparing import Comparer
-from rfedge.twin.scene import Board, TwinScene
+from rfedge.twin.scene import Board, PlacedField, TwinScene
 from rfedge.twin.server_source import tile_rows
 from rfedge.twin.web import TwinWeb, WebSettings
+from wall_scene import seen, wall_field
 
 pytestmark = [pytest.mark.slow, pytest.mark.sample]
 
@@ -265,13 +267,18 @@ async def test_the_table_of_tiles_opens_by_keyboard() -> None:
     board = Board()
     scene = TwinScene(board)
     scene.show_tiles(tile_rows([Tile("west", "a" * 64, lights=(dusk,))], [learnt]), 0.0)
-    web = TwinWeb(
-        WebSettings(Address("127.0.0.1", 0)), board, scene, Comparer(scene, Mock(Executor))
-    )
-    address = await web.start()
-    try:
+    async with served(board, scene) as address:
         with browser() as page:
             await asyncio.to_thread(opens_by_keyboard, page, address)
+
+
+@asynccontextmanager
+async def served(board: Board, scene: TwinScene) -> AsyncIterator[str]:
+    """Serve the page of a scene without a server; yield its address."""
+    settings = WebSettings(Address("127.0.0.1", 0))
+    web = TwinWeb(settings, board, scene, Comparer(scene, Mock(Executor)))
+    try:
+        yield await web.start()
     finally:
         await web.stop()
 
@@ -294,3 +301,52 @@ def opens_by_keyboard(page: webdriver.Chrome, address: str) -> None:
     assert own[:3] == ["west", "own", "1"]
     assert at_dusk[:4] == ["west", "h18, 18:30 UTC", "2", "2"]
     assert at_dusk[5] == "53 %"
+
+
+async def test_the_page_starts_upright_at_a_training_camera_and_follows_without_a_click() -> None:
+    """In a world with y down, as the cameras of ``wall_scene`` have it."""
+    sight = Sight((1.0, 0.5, -2.0), (0.0, 0.0, 1.0))
+    field = wall_field(0.5).described(FieldMetadata(up=(0.0, -1.0, 0.0), sights=(sight,)))
+    board = Board()
+    scene = TwinScene(board)
+    scene.place(PlacedField.of(field, "wall"), 0.0)
+    async with served(board, scene) as address:
+        with browser() as page:
+            await asyncio.to_thread(starts_upright, page, address, sight)
+            scene.show(seen(field), 0.0)
+            await asyncio.to_thread(follows_the_only_camera, page)
+            for camera in ("left", "right"):
+                scene.show(seen(field, key=("cav-1", camera)), 0.0)
+            scene.leave(("cav-1", "front"), 0.0)
+            await asyncio.to_thread(asks_which_camera_to_follow, page)
+
+
+PLACE = "return window.twin?.street.loaded() && window.twin.street.view.position.toArray()"
+UPWARD = (
+    "const {view} = window.twin.street; return view.up.clone().set(0, 1, 0)"
+    ".applyQuaternion(view.quaternion).toArray()"
+)
+
+
+def starts_upright(page: webdriver.Chrome, address: str, sight: Sight) -> None:
+    page.get(address)
+    assert until(lambda: page.execute_script(PLACE), LOADED_S) == pytest.approx(sight.eye_m)
+    assert page.execute_script(UPWARD) == pytest.approx((0.0, -1.0, 0.0), abs=1e-6)
+
+
+def follows_the_only_camera(page: webdriver.Chrome) -> None:
+    selected = "return document.querySelector('#wall figure.selected')?.dataset.camera"
+    assert until(lambda: page.execute_script(selected)) == "cav-1/front"
+    page.execute_script("document.getElementById('follow').click()")
+    until(lambda: page.execute_script(PLACE) == pytest.approx((0.0, 0.0, 0.0)))
+    assert page.execute_script("return document.getElementById('whom').offsetHeight") == 0
+
+
+def asks_which_camera_to_follow(page: webdriver.Chrome) -> None:
+    """The one that was followed is gone, and two others are there."""
+    until(lambda: sequences(page).keys() == {"cav-1/left", "cav-1/right"})
+    until(lambda: page.execute_script("return document.getElementById('whom').offsetHeight"))
+    page.execute_script("document.querySelector('#wall figure').click()")
+    until(lambda: not page.execute_script("return document.getElementById('whom').offsetHeight"))
+    page.execute_script("document.getElementById('overview').click()")
+    assert not page.execute_script("return document.getElementById('follow').checked")

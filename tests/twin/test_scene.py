@@ -3,19 +3,26 @@
 import json
 import struct
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfcore.camera import TileOrigin
+from rfcore.camera import Pose, TileOrigin
+from rfcore.dataset.source import SourceCamera
+from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput
-from rfcore.field import FieldMetadata, SplatField
+from rfcore.field import FieldMetadata, SplatField, save_field
+from rfcore.image import write_png
+from rfcore.vertical import Sight
 from rfcore.wire.tiles import LearntLight, Tile, TileLight, learnt_message, learnt_of
+from rfedge.cli.twin import Twin
 from rfedge.twin.scene import Board, Message, PlacedField, Reader, TwinScene
 from rfedge.twin.server_source import tile_rows
-from wall_scene import seen, wall_field
+from wall_scene import INTRINSICS, seen, wall_field
 
 
 def told(reader: Reader) -> list[dict[str, Any]]:
@@ -40,6 +47,42 @@ def test_tiles_lie_where_their_origins_say_relative_to_the_first(wall: SplatFiel
     fields, picture = told(board.read(lambda: None))
     assert [f["origin_m"] for f in fields["fields"]] == [(0.0, 0.0, 0.0), (120.25, 0.0, 0.0)]
     assert picture["origin_m"] == (120.25, 0.0, 0.0)
+
+
+def test_the_page_is_told_the_vertical_of_a_field_and_where_its_cameras_stood(
+    wall: SplatField,
+) -> None:
+    sight = Sight((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))
+    field = wall.described(FieldMetadata(up=(0.0, -1.0, 0.0), sights=(sight,)))
+    board = Board()
+    scene = TwinScene(board)
+    scene.place(PlacedField(field, "a", b"x"), 0.0)
+    (shown,) = told(board.read(lambda: None))[0]["fields"]
+    assert shown["up"] == (0.0, -1.0, 0.0)
+    assert shown["start"] == {"eye_m": (1.0, 2.0, 3.0), "towards": (0.0, 0.0, 1.0)}
+
+
+def test_a_vertical_that_is_asked_for_goes_before_that_of_a_field(wall: SplatField) -> None:
+    board = Board()
+    scene = TwinScene(board)
+    scene.up = (0.0, 1.0, 0.0)
+    scene.place(PlacedField(wall, "a", b"x"), 0.0)
+    (shown,) = told(board.read(lambda: None))[0]["fields"]
+    assert (shown["up"], shown["start"]) == ((0.0, 1.0, 0.0), None)
+
+
+def test_without_a_vertical_of_the_field_the_cameras_of_the_drive_show_it(
+    wall: SplatField, tmp_path: Path
+) -> None:
+    save_field(wall, tmp_path / "wall.rff")
+    write_png(tmp_path / "a.png", np.zeros((64, 96, 3), np.uint8))
+    taken = WrittenPicture("a.png", SourceCamera(INTRINSICS), Pose.identity())
+    write_transforms(tmp_path, [taken], None)
+    twin = Twin(str(tmp_path / "wall.rff"), drive=tmp_path)
+    for asked, up in ((twin, (0.0, -1.0, 0.0)), (replace(twin, up="y"), (0.0, 1.0, 0.0))):
+        scene = TwinScene(Board())
+        asked._source()(scene)
+        assert scene.up == up
 
 
 def test_a_new_version_of_a_tile_takes_the_place_of_the_old(wall: SplatField) -> None:

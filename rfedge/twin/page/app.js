@@ -11,22 +11,43 @@ const RECONNECT_MS = 500;
 const AGES_KEPT = 20000;
 const element = (id) => document.getElementById(id);
 
+// The camera that Follow looks along.
 const select = (camera) => {
   state.selected = camera;
   wall.select(camera);
   street.select(camera);
+  showFollowing();
+};
+// The camera that is seen in full, which the server compares with its field first.
+const compare = (camera) => {
+  state.compared = camera;
   send({ select: camera });
 };
 const street = new Street(element("street"));
-const wall = new Wall(element("wall"), (camera) => { select(camera); inspector.open(camera); });
-const inspector = new Inspector(element("inspect"), () => select(null));
+const wall = new Wall(element("wall"), (camera) => {
+  select(camera);
+  compare(camera);
+  inspector.open(camera);
+});
+const inspector = new Inspector(element("inspect"), () => compare(null));
 const plots = new Plots(element("plots"));
 const live = new LiveView(element("live"), street, (place) => send({ look: place }));
 const objects = new StreetObjects(street, element("things"));
-const state = { socket: null, selected: null, isLive: false, pictures: 0, ages: [] };
+const state = { socket: null, selected: null, compared: null, isLive: false, pictures: 0, ages: [] };
 
 function send(wish) {
   if (state.socket?.readyState === WebSocket.OPEN) state.socket.send(JSON.stringify(wish));
+}
+
+// The only camera needs no click.
+function selectOnly() {
+  const cameras = [...street.cameras.keys()];
+  if (!cameras.includes(street.selected)) select(cameras.length === 1 ? cameras[0].split("/") : null);
+}
+
+function showFollowing() {
+  element("follow").checked = street.following;
+  element("whom").hidden = !street.following || state.selected !== null;
 }
 
 // What of the page takes the server's time is asked for only where it can be had, and is looked at.
@@ -70,6 +91,7 @@ const handlers = {
     }
     street.setPicture(key(header), header, bitmap);
     wall.setPicture(key(header), header, bitmap);
+    selectOnly();
     plots.add(header);
   },
   async comparison(header, parts) {
@@ -93,6 +115,7 @@ const handlers = {
   departure(header) {
     street.remove(key(header));
     wall.remove(key(header));
+    selectOnly();
   },
 };
 
@@ -106,7 +129,7 @@ function connect() {
   const socket = new WebSocket(`ws${location.protocol.slice(4)}//${location.host}/socket`);
   socket.binaryType = "arraybuffer";
   state.socket = socket;
-  socket.onopen = () => send({ select: state.selected });
+  socket.onopen = () => send({ select: state.compared });
   socket.onmessage = ({ data }) => {
     const [header, parts] = decode(data);
     handlers[header.kind]?.(header, parts);  // kinds of a newer server are passed over
@@ -127,7 +150,8 @@ setInterval(() => {
   plots.draw();
 }, 1000);
 element("overview").onclick = () => street.overview();
-element("follow").onchange = ({ target }) => { street.following = target.checked; };
+element("follow").onchange = ({ target }) => street.setFollowing(target.checked);
+street.onFollowing = showFollowing;
 element("objects").onchange = showObjects;
 element("look").onclick = () => live.open();
 connect();

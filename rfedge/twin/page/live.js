@@ -103,7 +103,8 @@ export class LiveView {
     this.picture?.bitmap.close();
     this.picture = { header, bitmap, freshness };
     this.shown += 1;
-    const live = `${percent(header.live_share)} live`;
+    const live = `${percent(header.live_share)} live` +
+      (header.live_share > 0 ? "" : ": no camera sees what is seen from here; follow one");
     this.say([live, sources(header.cameras)].filter(Boolean).join("; "), false);
     this.draw();
   }

@@ -9,7 +9,8 @@ const SURE = 0.5;  // of confidence; less is shown dimmer
 const metres = (value) => `${value.toFixed(1)} m`;
 const speed = ({ velocity_mps: [x, y, z] }) => Math.hypot(x, y, z);
 
-function box(object) {
+// A box that stands on z = 0, turned as ``upright`` says: from axes with z up to the field's.
+function box(object, upright) {
   const depth = Math.min(object.width_m, MOST_DEPTH_M);
   const solid = new THREE.BoxGeometry(object.width_m, depth, object.height_m);
   const material = new THREE.LineBasicMaterial({ color: COLOUR, transparent: true,
@@ -18,11 +19,12 @@ function box(object) {
   solid.dispose();
   lines.position.z = object.height_m / 2;
   const group = new THREE.Group();
+  group.quaternion.copy(upright);
   group.add(lines);
   if (speed(object) > MOVES_MPS) {
-    const [x, y] = object.velocity_mps;
-    lines.rotation.z = Math.atan2(y, x);
-    const towards = new THREE.Vector3(x, y, 0).normalize();
+    const towards = new THREE.Vector3(...object.velocity_mps)
+      .applyQuaternion(upright.clone().invert()).normalize();
+    lines.rotation.z = Math.atan2(towards.y, towards.x);
     group.add(new THREE.ArrowHelper(towards, new THREE.Vector3(0, 0, 0.1), speed(object), COLOUR));
   }
   return group;
@@ -54,7 +56,7 @@ export class StreetObjects {
     const group = new THREE.Group();
     const placed = objects.map((object) => {
       const at = new THREE.Vector3(...object.at_m).add(new THREE.Vector3(...origin_m));
-      const shape = box(object);
+      const shape = box(object, this.street.upright);
       shape.position.copy(at);
       group.add(shape);
       return { object, at };

@@ -1,6 +1,6 @@
 // The street in three dimensions: splats of every tile, cameras as frusta with their pictures.
-// World axes are the field's: east, north, up, in metres. OpenCV cameras look along +z with y down,
-// three's along -z with y up: half a turn around x apart.
+// World axes are the field's, in metres; the field says which way is up. OpenCV cameras look along
+// +z with y down, three's along -z with y up: half a turn around x apart.
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
@@ -11,7 +11,8 @@ const DRAWING_SHARE = 0.2;  // of the time at most, for pictures alone
 const SLOW_MS = 400, QUICK_MS = 40, COARSEST = 0.25;  // fewer pixels while a drawing takes longer
 const TOO_SLOW_MS = 1000;  // without a GPU a drawing takes seconds, in which the whole page stands still
 const HALF_TURN = new THREE.Quaternion(1, 0, 0, 0);
-THREE.Object3D.DEFAULT_UP.set(0, 0, 1);
+const Z = new THREE.Vector3(0, 0, 1);
+const BACK_M = 20;  // how far an overview steps back, in a field as large as a street
 
 const vector = (m) => new THREE.Vector3(m[0], m[1], m[2]);
 const threeRotation = ([w, x, y, z]) => new THREE.Quaternion(x, y, z, w).multiply(HALF_TURN);
@@ -20,6 +21,8 @@ export class Street {
   constructor(parent) {
     this.parent = parent;
     this.following = false;
+    this.onFollowing = () => {};
+    this.upright = new THREE.Quaternion();  // from axes with z up to the field's
     this.cameras = new Map();
     this.tiles = new Map();
     this.selected = null;
@@ -37,11 +40,28 @@ export class Street {
     this.scene.add(new SparkRenderer({ renderer: this.renderer, onDirty: () => this.touch() }));
     this.view = new THREE.PerspectiveCamera(60, 1, NEAR_M, FAR_M);
     this.view.position.set(-20, -20, 15);
-    this.controls = new OrbitControls(this.view, this.renderer.domElement);
-    this.controls.addEventListener("change", () => this.touch());
-    this.controls.listenToKeyEvents(canvas);
+    this.setUp([0, 0, 1]);
     new ResizeObserver(() => this.resize()).observe(parent);
     this.renderer.setAnimationLoop(() => this.draw());
+  }
+
+  // OrbitControls takes the vertical when they are made.
+  setUp(up) {
+    const { domElement: canvas } = this.renderer;
+    const target = this.controls?.target ?? new THREE.Vector3();
+    this.controls?.dispose();
+    this.view.up.copy(vector(up)).normalize();
+    this.upright.setFromUnitVectors(Z, this.view.up);
+    this.controls = new OrbitControls(this.view, canvas);
+    this.controls.target.copy(target);
+    this.controls.addEventListener("change", () => this.touch());
+    this.controls.listenToKeyEvents(canvas);
+  }
+
+  setFollowing(following) {
+    this.following = following;
+    this.onFollowing(following);
+    this.touch();
   }
 
   resize() {
@@ -126,7 +146,7 @@ export class Street {
       });
       this.tiles.set(field.field, tile);
       this.scene.add(mesh);
-      if (!this.seenField) this.overview();
+      if (!this.seenField) this.start(field);
       this.seenField = true;
     }
     for (const tile of stale.values()) this.discard(tile);
@@ -140,21 +160,42 @@ export class Street {
     this.touch();
   }
 
+  // Where a camera stood that the field was trained on, or all of it.
+  start(field) {
+    this.setUp(field.up);
+    if (!field.start) { this.overview(); return; }
+    const eye = vector(field.start.eye_m).add(vector(field.origin_m));
+    this.lookFrom(eye, vector(field.start.towards).multiplyScalar(this.backM() / 2).add(eye));
+  }
+
+  lookFrom(eye, target) {
+    this.setFollowing(false);
+    this.view.position.copy(eye);
+    this.controls.target.copy(target);
+  }
+
+  // Half of the way between cameras of a field, where that is smaller than a street.
+  backM() {
+    const apart = Math.max(...[...this.tiles.values()].map(({ field }) => field.apart_m));
+    return apart > 0 ? Math.min(BACK_M, apart / 2) : BACK_M;
+  }
+
+  // From behind and above the first camera, or a camera that the field was trained on.
   overview() {
     const box = new THREE.Box3();
+    const seen = [...this.cameras.values()].map(({ group }) =>
+      [group.position, new THREE.Vector3(0, 0, -1).applyQuaternion(group.quaternion)]);
     for (const { field } of this.tiles.values()) {
       const origin = vector(field.origin_m);
       box.expandByPoint(vector(field.low_m).add(origin));
       box.expandByPoint(vector(field.high_m).add(origin));
+      const { start } = field;
+      if (start) seen.push([vector(start.eye_m).add(origin), vector(start.towards)]);
     }
-    for (const { group } of this.cameras.values()) box.expandByPoint(group.position);
-    if (box.isEmpty()) return;
-    this.following = false;
-    const cameras = [...this.cameras.values()];
-    const middle = cameras.length ? cameras[0].group.position : box.getCenter(new THREE.Vector3());
-    this.controls.target.copy(middle);
-    this.view.position.copy(middle).add(new THREE.Vector3(-18, -6, 12));
-    this.touch();
+    if (box.isEmpty() && !seen.length) return;
+    const [middle, ahead] = seen[0] ?? [box.getCenter(new THREE.Vector3()), new THREE.Vector3()];
+    const back = this.view.up.clone().multiplyScalar(0.4).addScaledVector(ahead, -0.9);
+    this.lookFrom(back.multiplyScalar(this.backM()).add(middle), middle);
   }
 
   // Where the user looks from, relative to the field whose ground is nearest; null without a field.
@@ -180,7 +221,7 @@ export class Street {
   }
 
   turnTo(point) {
-    this.following = false;
+    this.setFollowing(false);
     this.controls.target.copy(point);
     this.touch();
   }
@@ -202,7 +243,8 @@ export class Street {
       camera.group.quaternion.copy(threeRotation(header.rotation_wxyz));
     }
     camera.intrinsics = header.intrinsics;
-    if (isFirst) this.overview();
+    const placed = [...this.tiles.values()];
+    if (isFirst && !placed.some(({ field }) => field.start)) this.overview();
     this.touchLater();
   }
 
