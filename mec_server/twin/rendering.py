@@ -355,7 +355,7 @@ class ViewService:
         moment_s: float,
     ) -> RenderedView:
         """Return the view at ``moment_s`` (monotonic), or at the time of composing it if the
-        request is for now."""
+        request is for now; then pictures vouch for as long again as the view had to wait."""
         field = self._composing.open_field(tile.field_id)
         camera = _in_tile(request.camera, tile, field)
         _check_inside(camera, field)
@@ -369,7 +369,8 @@ class ViewService:
         pairs = zip(chosen, ages_s, strict=True)
         live = [(self._analysed(each, field, self._composing).live, age) for each, age in pairs]
         vehicles = [each.vehicle_id for each in chosen]
-        composed = compose(camera, view, live, request.max_age_s, vehicles)
+        max_age_s = request.max_age_s + (0.0 if past else now - moment_s)
+        composed = compose(camera, view, live, max_age_s, vehicles)
         cameras = tuple(
             LiveCamera(each.vehicle_id, each.frame.camera_id, age_s, share, picture.trust == 0)
             for each, (picture, age_s), share in zip(chosen, live, composed.shares, strict=True)
@@ -400,7 +401,8 @@ class ViewService:
 
     def _ground_ahead(self, camera: Camera, tile: ViewedTile) -> None:
         field = self._finding.open_field(tile.field_id)
-        self._finding.ground(field).ahead_of(camera)
+        ground = self._finding.ground(field)
+        ground.ahead_of(ground.upright(camera))
 
     def _analysed(
         self, picture: ReceivedPicture, field: RadianceField, thread: _FieldThread

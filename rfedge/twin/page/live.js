@@ -35,6 +35,14 @@ function sources(cameras) {
   return [...seen, ...outvoted].join("; ");
 }
 
+// Why no pixel of a view is live.
+function why(cameras) {
+  if (!cameras.length) return ": no camera near has sent a picture lately; follow one";
+  const youngest_ms = Math.min(...cameras.map((camera) => camera.age_ms));
+  if (youngest_ms > OLDEST_MS) return `: the newest picture is ${seconds(youngest_ms)} old`;
+  return ": no camera sees what is seen from here; follow one";
+}
+
 export class LiveView {
   constructor(panel, street, send) {
     const find = (id) => document.getElementById(id);
@@ -103,8 +111,7 @@ export class LiveView {
     this.picture?.bitmap.close();
     this.picture = { header, bitmap, freshness };
     this.shown += 1;
-    const live = `${percent(header.live_share)} live` +
-      (header.live_share > 0 ? "" : ": no camera sees what is seen from here; follow one");
+    const live = `${percent(header.live_share)} live${header.live_share > 0 ? "" : why(header.cameras)}`;
     this.say([live, sources(header.cameras)].filter(Boolean).join("; "), false);
     this.draw();
   }
