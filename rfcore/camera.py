@@ -3,7 +3,8 @@
 Conventions of the whole project: right-handed axes, metres; camera axes as in OpenCV
 (x right, y down, z forward); pixel centres at +0.5, so the centre of the top-left pixel is
 (0.5, 0.5). A transform is named ``dst_from_src``: ``world_from_cam`` maps camera coordinates to
-the tile's local ENU frame (x east, y north, z up).
+the tile's local frame, which is ENU (x east, y north, z up) unless its dataset has other axes
+(``rfcore.vertical``).
 
 Poses are float64. A tile's origin is subtracted before anything becomes float32, so that a
 metre stays a metre at UTM and ECEF magnitudes. All arithmetic here is plain Python on float64

@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import grpc
@@ -103,6 +104,33 @@ async def test_a_view_is_the_field_with_what_a_vehicle_sees_now(
     assert set(np.unique(view.age_ms)) == {round(1e3 * camera.age_s), NO_AGE}
     assert gone.live.any(), "a vehicle that left fades, it does not vanish"
     assert gone.cameras[0].age_s > camera.age_s
+
+
+async def test_a_view_that_had_to_wait_shows_what_was_fresh_when_it_was_asked_for(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy machine draws it three seconds late, and pictures vouch for two."""
+    clock, nearest = (
+        SimpleNamespace(monotonic=time.monotonic, time_ns=time.time_ns),
+        rendering.nearest,
+    )
+
+    def late(*args: Any) -> Any:
+        clock.monotonic = lambda: time.monotonic() + 3.0
+        return nearest(*args)
+
+    def look() -> Any:
+        with TwinClient(str(server.address)) as client:
+            return client.render(asked(street, max_age_s=2.0))
+
+    monkeypatch.setattr(rendering, "time", clock)
+    monkeypatch.setattr(rendering, "nearest", late)
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        await vehicle.told(coded.frames[0])
+        view = await asyncio.to_thread(look)
+    assert view.live.any()
+    assert view.cameras[0].age_s > 3.0
 
 
 FAR = Camera(INTRINSICS, Pose((0.0, 0.0, -40.0), (1.0, 0.0, 0.0, 0.0)))
