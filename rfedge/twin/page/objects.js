@@ -84,7 +84,7 @@ export class StreetObjects {
     this.list.replaceChildren(...all.flatMap(({ placed }) => placed.map((one) => this.row(one))));
     if (focused) this.list.querySelector(`button[data-id="${focused}"]`)?.focus();
     const problems = all.map(({ problem }) => problem).filter(Boolean);
-    this.status.textContent = problems.join("; ") || (this.list.children.length ? "" : "Nothing is seen.");
+    this.status.textContent = problems.join("; ") || (this.list.children.length ? "" : "Nothing was seen in the last second.");
   }
 
   row({ object, at }) {
