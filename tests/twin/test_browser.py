@@ -317,6 +317,7 @@ async def test_the_page_starts_upright_at_a_training_camera_and_follows_without_
             await asyncio.to_thread(follows_the_only_camera, page)
             for camera in ("left", "right"):
                 scene.show(seen(field, key=("cav-1", camera)), 0.0)
+            await asyncio.to_thread(until, lambda: len(sequences(page)) == 3)
             scene.leave(("cav-1", "front"), 0.0)
             await asyncio.to_thread(asks_which_camera_to_follow, page)
 
