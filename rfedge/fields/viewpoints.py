@@ -23,15 +23,12 @@ from rfcore.errors import InvalidInput
 from rfcore.field import Quality, RadianceField, SplatField
 from rfcore.image import Rgb, rgb_from_colour, write_png
 from rfcore.metrics import psnr
-from rfcore.vertical import Sight, upright_from
+from rfcore.vertical import Sight, seen_point, upright_from
 from rfcore.views import PosedPicture
 
 F64 = NDArray[np.float64]
 UPS = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 """Up in ENU, in OpenGL's world, and in the world of OpenCV and most COLMAP models."""
-LEAST_SPREAD, AIMED_RAD, MOST_OFF_RAD = 0.03, math.radians(20), math.radians(60)
-"""Cameras look at one point if their axes differ (least eigenvalue of the normal equations for the
-point, for each camera), half of them aim at it this well, and all of them this badly."""
 GAP_RAD = math.radians(100)
 """Cameras with a larger gap between them do not stand all around."""
 SWING = 0.5
@@ -88,42 +85,6 @@ def orbit(field: RadianceField, settings: OrbitSettings) -> list[Camera]:
     return [
         Camera(intrinsics, looking_at(middle + offset, middle, np.array(up))) for offset in offsets
     ]
-
-
-def seen_point(sights: Sequence[Sight]) -> F64 | None:
-    """Return the point that cameras look at, None where there is none: nearest to all axes."""
-    if len(sights) < 3:
-        return None
-    eyes, axes = _arrays(sights)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(axis=0)
-    if np.linalg.eigvalsh(normal)[0] < LEAST_SPREAD * len(sights):
-        return None
-    point = np.linalg.solve(normal, (across @ eyes[:, :, None]).sum(axis=0)[:, 0])
-    cosines = _cosines(sights, point)
-    aimed = np.median(cosines) > math.cos(AIMED_RAD) and cosines.min() > math.cos(MOST_OFF_RAD)
-    return np.asarray(point) if aimed else None
-
-
-def first_sight(sights: Sequence[Sight]) -> Sight | None:
-    """Return where to begin to look at a field: at the camera that aims best at what all look at,
-    else at the middle one; None without any."""
-    point = seen_point(sights)
-    if point is not None:
-        return sights[int(np.argmax(_cosines(sights, point)))]
-    return sights[len(sights) // 2] if sights else None
-
-
-def _arrays(sights: Sequence[Sight]) -> tuple[F64, F64]:
-    """Return places and axes, [N, 3] each."""
-    return np.array([s.eye_m for s in sights]), np.array([s.towards for s in sights])
-
-
-def _cosines(sights: Sequence[Sight], point: F64) -> F64:
-    """Return the cosines [N] of the angles between the cameras' axes and the ways to a point."""
-    eyes, axes = _arrays(sights)
-    ways = point - eyes
-    return np.asarray((ways * axes).sum(axis=1) / np.maximum(np.linalg.norm(ways, axis=1), 1e-9))
 
 
 def _among(sights: Sequence[Sight], middle: F64, up: Vec3, turns_rad: F64) -> F64:

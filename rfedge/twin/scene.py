@@ -18,8 +18,8 @@ from rfcore.camera import TileOrigin, Vec3
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.spz import encode_spz
 from rfcore.perception.objects import CameraKey, StreetObject
+from rfcore.vertical import first_sight
 from rfcore.wire.twin import NewestQueue, TwinPicture
-from rfedge.fields.viewpoints import first_sight
 
 CONNECTION, FIELDS, TILES = ("connection",), ("fields",), ("tiles",)
 

@@ -7,16 +7,8 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldMetadata, SplatField
 from rfcore.raster.gaussians import Gaussians
-from rfcore.vertical import Z_UP, Sight, sights_of
-from rfedge.fields.viewpoints import (
-    UPS,
-    OrbitSettings,
-    first_sight,
-    look_around,
-    looking_at,
-    orbit,
-    seen_point,
-)
+from rfcore.vertical import Z_UP, Sight, first_sight, seen_point, sights_of
+from rfedge.fields.viewpoints import UPS, OrbitSettings, look_around, looking_at, orbit
 
 
 @pytest.mark.parametrize("up", sorted(UPS))
