@@ -9,8 +9,10 @@ import pytest
 from rich.console import Console
 
 from lab.robust import EvalRobust
-from lab.robust.run import _interval, run_robust
+from lab.robust.report import CrossingRow
+from lab.robust.run import _at_equal_rate, _interval, run_robust
 from rfcore.errors import InvalidInput
+from rfedge.results import rows_of
 
 QUALITY_DB = 40.0
 
@@ -121,16 +123,18 @@ def test_more_seeds_give_means_with_intervals_and_the_first_seed_is_the_one_of_b
     first = one["crossings"][0]["seed"]
     kept = [r for r in result["crossings"] if r["seed"] == first]
     assert kept == one["crossings"]
-    lossy = [r for r in result["rows"] if r["loss_percent"]]
+    assert not any("ssim_ci95" in row for row in result["rows"]), "it was quick"
+    crossed = rows_of(CrossingRow, result["crossings"])
+    rows = _at_equal_rate(crossed, intervals=True)["rows"]
+    lossy = [row for row in rows if row.loss_percent]
     assert len(lossy) == 5 * 2
     for row in lossy:
-        low, high = row["ssim_ci95"]
-        assert row["seeds"] == seeds
-        assert low <= row["ssim"] <= high
-    assert any(row["ssim_ci95"][0] < row["ssim_ci95"][1] for row in lossy)
-    lossless = [r for r in result["rows"] if not r["loss_percent"]]
-    assert [r["seeds"] for r in lossless] == [1] * 5 * 2
-    assert not any("ssim_ci95" in r for r in lossless)
+        low, high = row.ssim_ci95
+        assert row.seeds == seeds
+        assert low <= row.ssim <= high
+    assert any(row.ssim_ci95[0] < row.ssim_ci95[1] for row in lossy)
+    lossless = [row for row in rows if not row.loss_percent]
+    assert [(row.seeds, row.ssim_ci95) for row in lossless] == [(1, None)] * 5 * 2
 
 
 def test_the_interval_of_a_mean_is_near_what_a_normal_distribution_has():
