@@ -7,25 +7,24 @@ import signal
 import sys
 
 import structlog
-import tyro
 
 from cav_agent.config import AgentConfig
 from cav_agent.vehicle import Vehicle
-from rfcore.errors import RfedgeError
-from rfcore.wire.settings import OPTIONS, configure_logs, words_of_command_line
+from rfcore.program import parse_options, run_program
+from rfcore.wire.settings import configure_logs, words_of_command_line
 
 
-def main() -> None:
-    """Parse the command line and drive; exit 2 with one line when it cannot be done."""
-    try:
-        words = words_of_command_line(sys.argv[1:])
-        config = tyro.cli(AgentConfig, config=OPTIONS, prog="cav-agent", args=words)
-        configure_logs(sys.stderr, config.log)
-        config.render.check()
-        asyncio.run(drive(config))
-    except (RfedgeError, OSError) as error:
-        print(f"cav-agent: {error}", file=sys.stderr)
-        sys.exit(2)
+def main() -> int:
+    """Parse the command line, drive, and return the exit status."""
+    return run_program("cav-agent", _run)
+
+
+def _run() -> None:
+    words = words_of_command_line(sys.argv[1:])
+    config: AgentConfig = parse_options(AgentConfig, "cav-agent", words)
+    configure_logs(sys.stderr, config.log)
+    config.render.check()
+    asyncio.run(drive(config))
 
 
 async def drive(config: AgentConfig) -> None:
@@ -38,4 +37,4 @@ async def drive(config: AgentConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

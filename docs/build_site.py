@@ -25,16 +25,14 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import tyro
-
 import lab.cli
 import rfedge.cli
 import streetgen.cli
 from cav_agent.config import AgentConfig
 from lab.pages.metrics import families
 from mec_server.config import ServerConfig
+from rfcore.program import parse_options
 from rfcore.wire.instruments import Family
-from rfcore.wire.settings import OPTIONS
 from rfedge.report.tables import SHOWN
 
 ROOT = Path(__file__).parents[1]
@@ -45,12 +43,8 @@ BUILD = ROOT / "build" / "docs"
 Parse = Callable[[Sequence[str]], object]
 PROGRAMS: Mapping[str, Parse] = {
     "rfedge": rfedge.cli.parse,
-    "cav-agent": lambda words: tyro.cli(
-        AgentConfig, config=OPTIONS, prog="cav-agent", args=list(words)
-    ),
-    "mec-server": lambda words: tyro.cli(
-        ServerConfig, config=OPTIONS, prog="mec-server", args=list(words)
-    ),
+    "cav-agent": lambda words: parse_options(AgentConfig, "cav-agent", words),
+    "mec-server": lambda words: parse_options(ServerConfig, "mec-server", words),
     "streetgen": streetgen.cli.parse,
     "rfedge-lab": lab.cli.parse,
 }

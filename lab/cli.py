@@ -1,11 +1,10 @@
-"""The ``rfedge-lab`` command line: one frozen dataclass an experiment (``rfedge.program``)."""
+"""The ``rfedge-lab`` command line: one frozen dataclass an experiment (``rfcore.program``)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Annotated
 
-import tyro
 from tyro.conf import subcommand
 
 from lab.adapt import EvalAdapt
@@ -27,7 +26,7 @@ from lab.servers import EvalScale
 from lab.size_tables import EvalSizing
 from lab.tcp import EvalTcp
 from lab.world import EvalWorld
-from rfedge.program import CONFIG, run_program
+from rfcore.program import parse_options, run_program
 
 Verb = (
     Annotated[EvalAdapt, subcommand("adapt")]
@@ -52,17 +51,16 @@ Verb = (
 )
 
 
+DESCRIPTION = "Experiments whose results are recorded in lab/results."
+
+
 def parse(arguments: Sequence[str] | None = None) -> Verb:
     """Return the experiment that ``arguments`` ask for, by default those of the process."""
-    return tyro.cli(
-        Verb,
-        prog="rfedge-lab",
-        description="Experiments whose results are recorded in lab/results.",
-        args=arguments,
-        config=CONFIG,
+    return parse_options(
+        Verb, "rfedge-lab", arguments, "Experiments whose results are recorded in lab/results."
     )
 
 
 def main() -> int:
     """Run one experiment and return its exit status."""
-    return run_program("rfedge-lab", parse)
+    return run_program("rfedge-lab", lambda: parse().run())

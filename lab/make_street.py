@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
-import tyro
 from tyro.conf import Positional
 
 from rfcore.dataset import write_manifest
@@ -26,7 +25,7 @@ from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, wri
 from rfcore.errors import DatasetError
 from rfcore.files import write_whole
 from rfcore.image import Rgb
-from rfedge.program import run_program
+from rfcore.program import parse_options, run_program
 from rfedge.samples import sample_path
 
 COMMAND = "make sample"
@@ -160,7 +159,7 @@ class MakeSample:
 
 def main() -> int:
     """Parse the command line and pack; return the exit status."""
-    return run_program("sample", lambda: tyro.cli(MakeSample, prog="sample"))
+    return run_program("sample", lambda: parse_options(MakeSample, "sample").run())
 
 
 if __name__ == "__main__":

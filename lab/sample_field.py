@@ -9,7 +9,6 @@ from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any
 
-import tyro
 from rich.console import Console
 from tyro.conf import Positional
 
@@ -18,10 +17,10 @@ from rfcore.errors import InvalidData
 from rfcore.field import SplatField
 from rfcore.field.store import encode_field
 from rfcore.files import write_whole
+from rfcore.program import parse_options, run_program
 from rfcore.train.schedule import Bands, DensityControl
 from rfcore.train.splats import SplatTrainingConfig
 from rfedge.demo.field import manifest_digest, sample_field_path, trained_field
-from rfedge.program import run_program
 from rfedge.results import Provenance, make_result, provenance, write_result
 from rfedge.samples import sample_path
 from rfedge.training.finish import size_goal
@@ -116,7 +115,7 @@ def _record(sample: Path, field: SplatField) -> dict[str, Any]:
 
 def main() -> int:
     """Parse the command line and make the field; return the exit status."""
-    return run_program("sample-field", lambda: tyro.cli(MakeSampleField, prog="sample-field"))
+    return run_program("sample-field", lambda: parse_options(MakeSampleField, "sample-field").run())
 
 
 if __name__ == "__main__":

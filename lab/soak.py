@@ -19,10 +19,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-import tyro
-
 from lab.report import Report
 from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.program import parse_options, run_program
 from rfedge.loadtest.drive import Sample
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.run import Run, TestBed, run_load
@@ -201,14 +200,10 @@ def _row(settings: SoakSettings, run: Run, samples: Sequence[Sample], *, held: b
 
 
 def main() -> None:
-    """Run from the command line; exit 2 if anything grew."""
-    settings = tyro.cli(SoakSettings, prog="python -m lab.soak")
-    try:
-        print(json.dumps(soak(settings)["rows"][0], indent=1))
-    except (RfedgeError, OSError) as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    """Soak as the command line says, and print the row."""
+    settings: SoakSettings = parse_options(SoakSettings, "lab.soak")
+    print(json.dumps(soak(settings)["rows"][0], indent=1))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_program("lab.soak", main))

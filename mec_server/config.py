@@ -269,9 +269,9 @@ class ServerConfig:
     render: RenderSettings = RenderSettings()
     metrics: MetricsSettings = MetricsSettings()
     transport: TransportSettings = TransportSettings()
-    notices: bool = True
-    """Warn vehicles that ask (`cav-agent --notices`) of what others see ahead of them; costs
-    nothing while none does (docs/how-to/twin.md)."""
+    no_notices: bool = False
+    """Do not warn vehicles that ask (`cav-agent --notices`) of what others see ahead of them
+    (docs/how-to/twin.md); warnings cost nothing while none asks."""
     access: Path | None = None
     """File that says what consumers may see and which certificates are revoked (TOML, see
     docs/how-to/operations.md); read again when it changes. Without it consumers see everything."""

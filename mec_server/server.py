@@ -347,7 +347,7 @@ class EdgeServer:
             look = partial(asyncio.to_thread, self._learner.look)
             self._follow(look, LEARNING_EVERY_S, BackgroundTask.LEARNING)
         self._follow(self.index_fields, FIELDS_EVERY_S, BackgroundTask.FIELDS)
-        if self._config.notices:
+        if not self._config.no_notices:
             self._follow(self._notices.follow, NOTICES_EVERY_S, BackgroundTask.NOTICES)
         self._follow(self._sweep_connections, CONNECTIONS_EVERY_S, BackgroundTask.CONNECTIONS)
         if self._nats is not None:
@@ -426,7 +426,7 @@ class EdgeServer:
         before = self._published.tiles
         if await asyncio.to_thread(self._published.refresh):
             tiles = self._published.tiles
-            if self._config.notices:
+            if not self._config.no_notices:
                 self._notices.fields_changed(before, tiles)
             self._metrics.show_tiles(tiles)
             every = dict.fromkeys(name for tile in tiles for name in tile.renderable_ids)

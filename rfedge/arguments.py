@@ -182,7 +182,7 @@ PEM = arg(metavar="FILE.pem")
 
 @dataclass(frozen=True)
 class TwinConnection:
-    """How a consumer of the twin reaches one server, or the NATS of all servers."""
+    """Connection of a consumer of the twin: to one server, or to the NATS of all servers."""
 
     nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
     """Show what all servers publish over this NATS (docs/how-to/servers.md), instead of one

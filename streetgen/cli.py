@@ -12,11 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import Positional, arg, subcommand
 
+from rfcore.program import parse_options, run_program
 from rfedge.arguments import FOLDER, JSON, SIZE, parse_size
-from rfedge.program import CONFIG, run_program
 
 SCENE = arg(metavar="SCENE")
 
@@ -72,7 +71,7 @@ class Build:
 
 @dataclass(frozen=True)
 class Plan:
-    """Check scene files; print their pictures and the effects that will run, with measured cost."""
+    """Check scene files; print their pictures and effects, with --render also what these cost."""
 
     scenes: Annotated[tuple[str, ...], Positional, arg(metavar="SCENE ...")]
     """Ready-made scenes by name, or scene files (.toml)."""
@@ -120,7 +119,7 @@ class Sheet:
     width_px: int = 1280
     """Width of the sheet, px."""
     max_bytes: int = 600_000
-    """The JPEG's quality is lowered until it fits."""
+    """Largest size of the JPEG; its quality is lowered until it fits."""
 
     def run(self) -> None:
         """Write the sheet; say how large it became."""
@@ -139,17 +138,19 @@ Verb = (
 )
 
 
+DESCRIPTION = "Declared streets, rendered with Mitsuba 3 into datasets for rfedge."
+
+
 def parse(arguments: Sequence[str] | None = None) -> Verb:
     """Return the verb that ``arguments`` ask for, by default those of the process."""
-    return tyro.cli(
+    return parse_options(
         Verb,
-        prog="streetgen",
-        description="Declared streets, rendered with Mitsuba 3 into datasets for rfedge.",
-        args=arguments,
-        config=CONFIG,
+        "streetgen",
+        arguments,
+        "Declared streets, rendered with Mitsuba 3 into datasets for rfedge.",
     )
 
 
 def main() -> int:
     """Run one verb and return its exit status."""
-    return run_program("streetgen", parse)
+    return run_program("streetgen", lambda: parse().run())

@@ -24,11 +24,11 @@ class PlanCity:
     """Plan a city's cells, servers and vehicles over the hours, and say what breaks first."""
 
     city: Annotated[Path, Positional, arg(metavar="CITY.toml")]
-    """The city to plan, of which it says everything (see samples/sizing/city.toml)."""
+    """File that describes the city (see samples/sizing/city.toml)."""
     fcd: Annotated[Path | None, arg(metavar="FILE.xml[.gz]")] = None
-    """Its vehicles: FCD output of SUMO, in place of the stated demand."""
+    """The city's vehicles as FCD output of SUMO, instead of the stated demand."""
     step_s: float = 1.0
-    """Seconds between the steps of its stated demand."""
+    """Time step of the stated demand, s."""
     out: Path = Path("out/eval/city.json")
     """The result file to write."""
 

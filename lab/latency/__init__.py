@@ -38,7 +38,7 @@ class EvalLatency(Experiment):
     effort: str = DEFAULT_EFFORT
     """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: str = "veryfast"
-    """x264 preset of the other."""
+    """Preset of x264, which is compared with."""
     quality_db: float = 33.0
     """Luma PSNR that both are coded to."""
     out: Path = Path("out/eval/latency.json")

@@ -40,7 +40,7 @@ class EvalLive:
     source_seconds: float = 300.0
     """Duration of each drive at 10 Hz."""
     kill_every_s: float = 60.0
-    """Its sender is killed so often, and started again."""
+    """Seconds after which a live camera's sender is killed, and started again."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive, the only one in its folder."""
     drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")

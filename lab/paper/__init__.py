@@ -31,7 +31,7 @@ class EvalPaper(Experiment):
     """Folder of the picture that shows the fields beside the camera (SVG)."""
     cells: Path = Path("out/eval/paper")
     every: int = 1
-    """Take each so many-th frame of a drive; neighbours at 10 Hz show almost the same."""
+    """Take every Nth frame of a drive; neighbours at 10 Hz show almost the same."""
     processes: int = 1
     """Number of processes that code at once; the rows do not depend on it."""
 

@@ -38,7 +38,7 @@ class EvalRobust(Experiment):
     effort: str = DEFAULT_EFFORT
     """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: str = "veryfast"
-    """x264 preset of the others."""
+    """Preset of x264 in the methods compared with."""
     quality_db: float = 33.0
     """Luma PSNR at which bits are compared where nothing is lost."""
     frames: int = 36

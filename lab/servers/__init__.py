@@ -45,16 +45,16 @@ class EvalScale:
     """Seconds before they are counted."""
     planned_runs: int = 3
     """Number of runs of each of these loads; the medians count."""
-    envoy: bool = True
-    """Run the cases behind Envoy; --no-envoy: only what else is asked for."""
-    moves: bool = True
-    """Kill, drain and add servers there; --no-moves: only measure what Envoy adds."""
+    no_envoy: bool = False
+    """Leave out the cases behind Envoy: do only what else is asked for."""
+    no_moves: bool = False
+    """Kill, drain and add no servers: measure only what Envoy adds."""
     nats: bool = False
     """Also restart the NATS that two servers publish to, `rounds` times (Debian's nats-server)."""
     ray_tiles: Annotated[Path | None, FOLDER] = None
-    """Also train the tiles that `rfedge dataset split` put there: one after another, on a Ray that
-    is started here, and again with a worker killed. Needs rfedge[ray] and the time of three
-    trainings."""
+    """Also train the tiles that `rfedge dataset split` put there: one after another, on a Ray
+    cluster that is started here, and again with a worker killed. Needs rfedge[ray] and the time of
+    three trainings."""
     ray_iterations: int = 2000
     """Iterations of each of those."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")

@@ -80,9 +80,9 @@ def cases_of(job: EvalScale) -> list[Case]:
     Raises ``InvalidInput`` for none, and for what one of them cannot take.
     """
     cases: list[Case] = []
-    if job.envoy and job.moves:
+    if not (job.no_envoy or job.no_moves):
         cases.append(moves)
-    if job.envoy and job.pairs:
+    if job.pairs and not job.no_envoy:
         cases.append(added_by_envoy)
     if job.planned:
         cases.append(_planned_rows)

@@ -38,7 +38,7 @@ class EvalWorld:
     aside_m: tuple[float, ...] = (1.0, 2.0, 3.0)
     """Distances to the left of the drive at which views are compared."""
     every: int = 6
-    """A view is compared at each so-manieth picture of a drive."""
+    """Compare a view at every Nth picture of a drive."""
     notices_hz: float = 5.0
     """Rate of the two vehicles of which one is told what the other sees."""
     seconds: float = 30.0

@@ -117,7 +117,7 @@ def view_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
 def _gains(
     asked: EvalWorld, field: RadianceField, drive: Drive, truth: SceneTruth, empty: SceneTruth
 ) -> Iterator[Gain]:
-    """Yield the gain of each view beside every so-manieth picture of a drive."""
+    """Yield the gain of each view beside every Nth picture of a drive."""
     ground = FieldGround(field.render, field.metadata.vertical)
     for index, seen in enumerate(_received(drive, field)):
         if index % asked.every:

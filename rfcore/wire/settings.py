@@ -20,16 +20,13 @@ from pathlib import Path
 from typing import Annotated, TextIO
 
 import structlog
-from tyro.conf import EnumChoicesFromValues, FlagCreatePairsOff, OmitArgPrefixes, arg
+from tyro.conf import arg
 
 from rfcore.errors import InvalidInput
 from rfcore.files import DECODED_BYTES
 from rfcore.raster.renderers import CPU, renderer_isa
 from rfcore.wire.tls import TlsFiles
 
-# How a service's configuration becomes options: flat names, words of enumerations as they
-# are in logs, and flags without a --no- twin.
-OPTIONS = (OmitArgPrefixes, EnumChoicesFromValues, FlagCreatePairsOff)
 PORT_MAX = 65535
 CONFIG_FILE = "--config"
 CONFIG = arg(metavar="FILE.toml")
@@ -69,7 +66,7 @@ class MetricsSettings:
     """Address at which Prometheus may collect metrics."""
 
     port: Annotated[int | None, arg(name="metrics-port")] = None
-    """Port for Prometheus; 0 takes a free one, none are served without it."""
+    """Port for Prometheus; 0 takes a free one. Without it no metrics are served."""
     host: Annotated[str, arg(name="metrics-host")] = "127.0.0.1"
     """Address the metrics are served on."""
     per_vehicle: Annotated[bool, arg(name="metrics-per-vehicle")] = False
@@ -82,7 +79,7 @@ class MetricsSettings:
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Options of rendering fields; the pictures do not depend on them."""
+    """Rendering of fields; the pictures do not depend on these options."""
 
     threads: int = 1
     """Threads per render."""
@@ -91,8 +88,8 @@ class RenderSettings:
     max_field_gb: Annotated[float, arg(name="max-field-gb")] = DECODED_BYTES / 1e9
     """Memory that the splats of a field may take; a small file can hold very many."""
     renderer: Annotated[str, arg(metavar="cpu|opencl[:DEVICE]")] = CPU
-    """Splats are drawn by the CPU, or by an OpenCL device: its number or a part of its name; the
-    first GPU without. A device whose bytes are not those of the CPU is refused."""
+    """Draw splats by the CPU, or by an OpenCL device, named by its number or a part of its name;
+    `opencl` alone takes the first GPU. A device that makes other bytes than the CPU is refused."""
 
     @property
     def field_isa(self) -> str | None:
@@ -123,13 +120,13 @@ class TransportSettings:
     """Certificates of this process and of the authority; plaintext without them."""
 
     certificate: Annotated[Path | None, arg(name="tls-cert")] = None
-    """Certificate of this process (PEM); a vehicle's names --vehicle."""
+    """Certificate of this process (PEM); that of a vehicle names its --vehicle."""
     key: Annotated[Path | None, arg(name="tls-key")] = None
     """Its private key."""
     authority: Annotated[Path | None, arg(name="tls-ca")] = None
     """Certificate of the authority that vouches for the other end."""
     allow_insecure: bool = False
-    """Speak plaintext with other machines."""
+    """Allow plaintext to and from other machines."""
 
     def __post_init__(self) -> None:
         self.tls()

@@ -1,13 +1,13 @@
-"""The ``rfedge`` command line: one frozen dataclass a verb (``rfedge.program``)."""
+"""The ``rfedge`` command line: one frozen dataclass a verb (``rfcore.program``)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Annotated
 
-import tyro
 from tyro.conf import subcommand
 
+from rfcore.program import parse_options, run_program
 from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.dataset import Dataset
 from rfedge.cli.field import Field
@@ -19,7 +19,6 @@ from rfedge.cli.size import Size
 from rfedge.cli.twin import Twin
 from rfedge.demo import Demo
 from rfedge.link import LinkSettings
-from rfedge.program import CONFIG, run_program
 from rfedge.training import Train
 
 __all__ = ["main", "parse"]
@@ -51,9 +50,10 @@ def parse(arguments: Sequence[str] | None = None) -> Verb:
 
     Prints help or what is wrong, and raises ``SystemExit``, where they ask for none.
     """
-    return tyro.cli(Verb, prog="rfedge", description=DESCRIPTION, args=arguments, config=CONFIG)
+    verb: Verb = parse_options(Verb, "rfedge", arguments, DESCRIPTION)
+    return verb
 
 
 def main() -> int:
     """Parse the command line, run one verb, and return its exit status."""
-    return run_program("rfedge", parse)
+    return run_program("rfedge", lambda: parse().run())

@@ -16,8 +16,8 @@ from rfcore.codec.h264.config import (
     CoderSettings,
     LightChange,
 )
+from rfcore.program import working
 from rfedge.arguments import DATASET, FIELD, RENDERER, check_folder, open_drive, open_field
-from rfedge.program import working
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

@@ -39,7 +39,7 @@ class DatasetConvert:
     every: int = 1
     """Take each n-th picture."""
     offset: int = 0
-    """Leave out so many of the first pictures."""
+    """Number of first pictures to leave out."""
 
     def run(self) -> None:
         """Convert; the folder appears when all of it is there."""
@@ -61,9 +61,9 @@ class DatasetSplit:
     length: Annotated[float, arg(metavar="M")]
     """Longest side of a tile's ground, m."""
     overlap: Annotated[float, arg(metavar="M")] = 10.0
-    """How far two tiles side by side share their pictures, m."""
+    """Length over which neighbouring tiles share their pictures, m."""
     fewest: int = 8
-    """Pictures that a tile must have."""
+    """Least number of pictures of a tile."""
     points_within: Annotated[float, arg(metavar="M")] = 60.0
     """A tile takes the dataset's points on its ground and within this distance of it, m."""
 

@@ -43,7 +43,7 @@ class FieldImport:
     """The file; properties of a .ply are found by name, text and binary alike. Axes stay those of
     the file: a .spz that its makers' own tool made from a .ply is turned half round x."""
     name: Annotated[str, arg(metavar="NAME")]
-    """What to call the field; every command that takes a field knows it by this name."""
+    """Name of the field; every command that takes a field knows it by this name."""
     out: Annotated[Path | None, RFF] = None
     """The archive to write (default: out/fields/NAME.rff)."""
     replace: bool = False
@@ -280,13 +280,13 @@ class FieldSlim:
     out: Annotated[Path, RFF]
     """The archive to write."""
     keep: int | None = None
-    """How many splats to keep; or --max-mb, --passes or both, which choose that, the steps of every
-    number and the bits of colours, and fit lower levels of detail (with --drive). Default: all."""
+    """Number of splats to keep; default: all. --max-mb and --passes choose it instead, with the
+    precision of every value, and fit lower levels of detail (with --drive)."""
     max_mb: float | None = None
-    """The archive may have at most so many MB (10^6 bytes)."""
+    """Largest size of the archive, MB (10^6 bytes)."""
     passes: int | None = None
-    """Write the size with the fewest bytes of field and stream over so many passes of --drive:
-    its pictures are coded against every size; of those within --max-mb if both are given."""
+    """Write the size with the fewest bytes of field and stream over this number of passes of
+    --drive, whose pictures are coded against every size; --max-mb limits the choice."""
     drive: Annotated[Path | None, DATASET] = None
     """Posed pictures whose cameras the field is to serve; their pixels are read for --passes only.
     Without this, opacity and area decide what matters."""

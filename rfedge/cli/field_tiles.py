@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from rfcore.program import working
 from rfedge.arguments import FIELD, FOLDER, field_path
-from rfedge.program import working
 
 if TYPE_CHECKING:
     from rfcore.wire.tile_manifest import Publication, VersionLabel

@@ -47,8 +47,8 @@ class FieldUpdate:
     threads: int = 1
     """Threads of the renderer."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Learn on a Ray (`local` starts one here; docs/how-to/servers.md), as a job of --threads
-    cores; the archive is the same bytes. Needs rfedge[ray]."""
+    """Learn on the Ray cluster at this address, as a job of --threads cores; `local` starts one
+    here (docs/how-to/servers.md). The archive has the same bytes. Needs rfedge[ray]."""
 
     def run(self) -> None:
         """Learn, try, write, here or as a job."""

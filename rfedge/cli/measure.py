@@ -36,7 +36,7 @@ class LoadTest:
     duration: float = 20.0
     """Measured time, s."""
     warm_up: float = 10.0
-    """Time before it that is not measured, s."""
+    """Time before the measurement, s: caches fill."""
     deadline_ms: float = 100.0
     """Time that a picture may take from the moment it is due to its Ack, ms."""
     vehicle_ms: float = 0.0

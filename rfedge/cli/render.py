@@ -49,7 +49,7 @@ class Render:
     threads: int = 2
     """Threads of the renderer."""
     isa: str | None = None
-    """Force an instruction set: avx512, avx2, neon or scalar."""
+    """Instruction set to force: avx512, avx2, neon or scalar; default: the best of this machine."""
     renderer: Annotated[str, RENDERER] = "cpu"
     """Render splats on the CPU or on an OpenCL device; the bytes are the same."""
 

@@ -16,7 +16,7 @@ class Watch:
     """Print, and if asked keep, the pictures a server reconstructs, until it stops or Ctrl-C."""
 
     address: Annotated[str | None, Positional, ADDRESS] = None
-    """Where mec-server listens."""
+    """Address of mec-server."""
     vehicle: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
     """Only these vehicles; default: all."""
     dir: Annotated[Path | None, FOLDER] = None
@@ -24,7 +24,8 @@ class Watch:
     mp4: Annotated[Path | None, arg(metavar="FILE.mp4")] = None
     """Keep one camera, the first that is seen, as a video; its times are those of capture."""
     encoding: Literal["none", "i420", "jpeg", "png"] | None = None
-    """How pictures travel; default: i420 (exact) for a video, jpeg for a folder, else none."""
+    """Form in which pictures are sent; default: i420 (exact) for a video, jpeg for a folder, else
+    none."""
     pictures: int | None = None
     """Stop after this many pictures."""
     connection: OmitArgPrefixes[TwinConnection] = TwinConnection()
@@ -66,17 +67,17 @@ class CertsInit:
     vehicles: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("cav-1",)
     """Vehicles; each certificate is good for that name (cav-agent --vehicle) only."""
     consumers: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("watch",)
-    """Who may watch the twin and ask for the server's health, without being a vehicle."""
+    """Consumers, which are no vehicles; they may watch the twin and ask for the server's health."""
     operators: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
-    """Who may see everything, whatever consumers are granted."""
+    """Operators, which may see everything, whatever consumers are granted."""
     proxies: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
     """Proxies before the servers, as in mec-server --proxy-identity."""
     hosts: Annotated[tuple[str, ...], arg(metavar="HOST ...")] = ("localhost", "127.0.0.1", "::1")
     """Names and addresses by which vehicles reach the server."""
     days: int = 365
-    """How long the certificates are good."""
+    """Days for which the certificates are valid."""
     replace: bool = False
-    """Replace the certificates in OUT; those signed before are then worth nothing."""
+    """Replace the certificates in OUT; earlier ones are then refused."""
 
     def run(self) -> None:
         """Make them and say what is where."""
@@ -107,7 +108,7 @@ class CertsAdd:
     proxies: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
     """Proxies to add."""
     days: int = 90
-    """How long the certificates are good."""
+    """Days for which the certificates are valid."""
 
     def run(self) -> None:
         """Sign, write, and say what is where."""

@@ -19,7 +19,7 @@ class DatasetRecordCarla:
     out: Annotated[Path, FOLDER]
     """The folder to make: pictures and transforms.json."""
     host: Annotated[str, arg(metavar="HOST")] = "127.0.0.1"
-    """Where the server runs."""
+    """Host of the CARLA server."""
     port: Annotated[int, arg(metavar="PORT")] = 2000
     """Its RPC port."""
     town: Annotated[str | None, arg(metavar="MAP")] = None
@@ -30,8 +30,8 @@ class DatasetRecordCarla:
     """Places along the lane where all cameras take a picture, each way."""
     spacing_m: float = 4.0
     """Metres between them."""
-    both_ways: bool = True
-    """Drive back on the lane of the other direction."""
+    no_both_ways: bool = False
+    """Do not drive back on the lane of the other direction."""
     keep_parked: bool = False
     """Keep the map's own parked vehicles in the pictures."""
     cameras: Annotated[str, arg(metavar="NAME,...")] = "all"

@@ -36,7 +36,7 @@ class Experiment:
     cells: Path
     """Folder of finished pieces."""
     quick: bool = False
-    """A few frames alone: to see that it works, not for figures."""
+    """Code only a few frames, to see that it works; the figures mean nothing."""
 
     def __post_init__(self) -> None:
         check_result_path(self.out)

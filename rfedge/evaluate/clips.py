@@ -173,7 +173,7 @@ MAX_NOISE_SIGMA = 64.0
 """Levels; nothing of a picture is left."""
 
 DECIMATION = 5
-"""Every so-manieth frame stands for a slow camera: 2 Hz of 10."""
+"""Every fifth frame stands for a slow camera: 2 Hz of 10."""
 
 
 @dataclass(frozen=True)

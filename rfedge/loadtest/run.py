@@ -21,6 +21,7 @@ from rich.console import Console
 
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CoderSettings
 from rfcore.field import load_field
+from rfcore.program import working
 from rfcore.raster.renderers import CPU
 from rfedge.loadtest.drive import (
     RunMeasurements,
@@ -33,7 +34,6 @@ from rfedge.loadtest.drive import (
 from rfedge.loadtest.plan import SETTLING_S, Load, Mode, Vehicles, Verdict, judge
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
 from rfedge.processes import Service, command_of, service
-from rfedge.program import working
 from rfedge.report.charts import RENDER, STYLE, new_axes, svg
 from rfedge.report.page import write_page
 from rfedge.report.tables import text_table

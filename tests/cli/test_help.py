@@ -14,6 +14,11 @@ from unittest.mock import patch
 
 import pytest
 
+import lab.cli
+import streetgen.cli
+from cav_agent.config import AgentConfig
+from mec_server.config import ServerConfig
+from rfcore.program import parse_options
 from rfedge.cli import main
 
 GROUPS = ("field", "dataset", "eval", "certs")
@@ -75,6 +80,31 @@ def test_every_verb_has_help_that_says_once_what_it_does():
         text = in_one_line(help_of(verb))
         assert text.count(in_one_line(help_of(verb).split("\n\n")[1])) == 1, verb
         assert "{None}" not in text, verb
+        assert "(default: True)" not in text, f"{verb}: a flag does the opposite of its text"
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (AgentConfig, "cav-agent"),
+        (ServerConfig, "mec-server"),
+        (lab.cli.Verb, "rfedge-lab scale"),
+        (streetgen.cli.Verb, "streetgen build"),
+    ],
+)
+def test_every_program_wraps_its_help_by_the_width_alone(kind, name, monkeypatch, capsys):
+    """No line of an option's text has room for the first word of the next."""
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit):
+        parse_options(kind, name, [*name.split()[1:], "--help"])
+    page = capsys.readouterr().out
+    boxed = [line[2:-2] for line in page.splitlines() if line.startswith("│")]
+    indents = [len(line) - len(line.lstrip()) for line in boxed]
+    room = [len(line) - len(line.rstrip()) for line in boxed]
+    wrapped = [k for k in range(1, len(boxed)) if indents[k] == indents[k - 1] > 5]
+    assert len(wrapped) > 3
+    assert all(len(boxed[k].split()[0]) >= room[k - 1] for k in wrapped), page
+    assert "(default: True)" not in page
 
 
 @pytest.mark.parametrize(

@@ -105,10 +105,8 @@ def test_servers_may_reach_nats_and_names_and_nothing_else():
 
 
 def test_servers_are_started_with_options_that_there_are(tmp_path):
-    import tyro
-
     from mec_server.config import ServerConfig
-    from rfcore.wire.settings import OPTIONS
+    from rfcore.program import parse_options
     from rfedge.certs import Members, certify, write_certificates
 
     (container,) = pods()["mec-server"]["containers"]
@@ -116,7 +114,7 @@ def test_servers_are_started_with_options_that_there_are(tmp_path):
     write_certificates(certs, certify(Members(()), NOW, 10))
     (tmp_path / "fields").mkdir()
     given = [re.sub(r"=/(certs|fields)", f"={tmp_path}/\\1", arg) for arg in container["args"]]
-    config = tyro.cli(ServerConfig, config=OPTIONS, args=given)
+    config = parse_options(ServerConfig, "mec-server", given)
     assert config.proxy_identity == ("edge-proxy",)
     grace_s = pods()["mec-server"]["terminationGracePeriodSeconds"]
     assert grace_s >= 2 * (config.drain_hold_s + config.drain_s)

@@ -14,7 +14,6 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-import tyro
 
 from cav_agent.config import AgentConfig, AgentLimits
 from docs.pages import Page
@@ -23,8 +22,8 @@ from integration.test_envoy import Groups, part_of_drive
 from lab.servers.envoy import CLUSTER
 from mec_server.config import ServerConfig
 from rfcore.errors import FieldFormatError, InvalidData, RfedgeError
+from rfcore.program import parse_options
 from rfcore.wire.conventions import VEHICLE
-from rfcore.wire.settings import OPTIONS
 from rfcore.wire.tile_manifest import Ground, publish, read_publication
 from rfcore.wire.tiles import Area
 from rfcore.wire.v1 import field_pb2 as pb
@@ -83,7 +82,7 @@ class Operator:
                 await self._ended(line)
 
     async def _drive(self, words: list[str]) -> None:
-        page = tyro.cli(AgentConfig, config=OPTIONS, args=words)
+        page = parse_options(AgentConfig, "cav-agent", words)
         changes = {
             "drive": page.drive, "fields": page.fields, "loop": page.loop, "report": page.report,
             "neighbours": tuple(self._addresses[place] for place in page.neighbours),
@@ -93,7 +92,7 @@ class Operator:
         self.vehicles.append(await self._stack.enter_async_context(drive))
 
     async def _start(self, words: list[str], pid_file: str) -> None:
-        page = tyro.cli(ServerConfig, config=OPTIONS, args=words)
+        page = parse_options(ServerConfig, "mec-server", words)
         if self._serve is not None:
             server = await self._stack.enter_async_context(self._serve(fields=page.fields))
             self._addresses[page.listen] = str(server.address)

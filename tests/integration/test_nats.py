@@ -405,7 +405,7 @@ def test_the_case_is_measured_with_servers_and_vehicles_as_processes(
     job = EvalScale(
         vehicles=4, servers=2, rounds=1, hz=2.0, size=None, pairs=0, seconds=1.0,
         field=street.store / "street.rff", drive=street.drive, config=DEPLOY,
-        work=tmp_path / "work", out=tmp_path / "scale.json", envoy=False, nats=True,
+        work=tmp_path / "work", out=tmp_path / "scale.json", no_envoy=True, nats=True,
     )  # fmt: skip
     try:
         run_scale(job, Console(quiet=True))

@@ -68,7 +68,7 @@ def test_a_small_load_is_compared_with_its_plan(tmp_path):
     job = EvalScale(
         vehicles=2, servers=2, rounds=1, hz=1.0, size=None, pairs=0, seconds=3.0,
         field=fields / "street.rff", drive=drive, config=tmp_path, work=tmp_path / "work",
-        out=tmp_path / "scale.json", planned=(12,), planned_hz=2.0, envoy=False,
+        out=tmp_path / "scale.json", planned=(12,), planned_hz=2.0, no_envoy=True,
         planned_warm_up_s=1.0, planned_runs=1,
     )  # fmt: skip
     try:
@@ -86,4 +86,4 @@ def test_a_small_load_is_compared_with_its_plan(tmp_path):
 
 def test_nothing_to_measure_is_refused(tmp_path):
     with pytest.raises(InvalidInput, match="nothing is to be measured"):
-        run_scale(EvalScale(envoy=False, work=tmp_path / "work"), Console(quiet=True))
+        run_scale(EvalScale(no_envoy=True, work=tmp_path / "work"), Console(quiet=True))

@@ -127,8 +127,8 @@ def test_what_cannot_be_run_is_refused(changes):
 
 def test_behind_envoy_there_is_something_to_measure():
     with pytest.raises(InvalidInput, match="nothing is to be measured"):
-        cases_of(EvalScale(moves=False, pairs=0))
-    assert cases_of(EvalScale(moves=False, pairs=2)) == [added_by_envoy]
+        cases_of(EvalScale(no_moves=True, pairs=0))
+    assert cases_of(EvalScale(no_moves=True, pairs=2)) == [added_by_envoy]
 
 
 # --- one result of several runs

@@ -4,10 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import tyro
 
 from rfcore.errors import BackendUnavailable, InvalidInput
-from rfcore.wire.settings import OPTIONS, MetricsSettings, RenderSettings, TransportSettings
+from rfcore.program import parse_options
+from rfcore.wire.settings import MetricsSettings, RenderSettings, TransportSettings
 
 
 @pytest.mark.parametrize(
@@ -40,8 +40,8 @@ def test_a_bad_setting_is_refused_by_the_name_of_its_option(
 
 
 def test_groups_become_flat_options() -> None:
-    metrics = tyro.cli(
-        MetricsSettings, config=OPTIONS, args=["--metrics-port", "9", "--metrics-per-vehicle"]
+    metrics = parse_options(
+        MetricsSettings, "mec-server", ["--metrics-port", "9", "--metrics-per-vehicle"]
     )
     assert metrics == MetricsSettings(port=9, per_vehicle=True)
 

@@ -30,10 +30,10 @@ class EvalCompare(Experiment):
     NAME@HZ=DATASET,FIELD.rff for one of another field;
     with `,noise=3` at the end: with a camera's noise of that standard deviation, in code values."""
     decimated: tuple[str, ...] = ()
-    """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
+    """NAME@HZ=DATASET for each drive that is coded at a fifth of its rate: every fifth frame."""
     background: tuple[str, ...] = ()
-    """The same for the empty street of a drive, frame by frame at its poses: tells what is not in
-    the field, for the split of the bits and for a rival that sends only the foreground."""
+    """NAME@HZ=DATASET with the empty street of a drive, frame by frame at its poses: tells what is
+    not in the field, for the split of the bits and for a rival that sends only the foreground."""
     effort: str = DEFAULT_EFFORT
     """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: Preset = "veryfast"
@@ -43,8 +43,8 @@ class EvalCompare(Experiment):
     method: tuple[str, ...] = ()
     """More codecs to compare with, as package.module:Class (see docs/explanation/evaluation.md)."""
     rivals: tuple[str, ...] = ()
-    """These rivals alone, by PSNR alone, as x264-our-tools-medium; x264-lowdelay-psnr, which
-    a field is paid for against, is always among them."""
+    """Compare with these rivals only, such as x264-our-tools-medium, and by PSNR only.
+    x264-lowdelay-psnr is added: the cost of sending the field is counted against it."""
     window: tuple[float, float] | None = None
     """Lowest and highest luma PSNR to compare over, in dB; 32 35 (and 30 35 where all reach it) if
     not given. Curves are coded at more points until they span it."""
@@ -54,8 +54,9 @@ class EvalCompare(Experiment):
     """Number of processes that code at once; processor times are taken afterwards, one at a time,
     and the rows do not depend on it."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Code what is not there yet on a Ray (`local` starts one here; docs/how-to/servers.md);
-    processor times are taken here afterwards, and the rows are the same. Needs rfedge[ray]."""
+    """Code what is not there yet on the Ray cluster at this address (`local` starts one here;
+    docs/how-to/servers.md). Processor times are taken here afterwards, and the rows are the same.
+    Needs rfedge[ray]."""
     figures: Path | None = None
     """Folder for the curves as SVG, with their numbers as CSV."""
 

@@ -26,7 +26,7 @@ class EvalLadder(Experiment):
     """
 
     fields: Annotated[tuple[Path, ...], Positional] = (sample_path("fields/street.rff"),)
-    """Field archives (.rff), of any kind; the first one's full rung is what rates are against."""
+    """Field archives (.rff) of any kind; rates are relative to the full rung of the first."""
     drive: Path = sample_path("street/transforms_drive_vehicles.json")
     """The drive to code."""
     frames: int = 24

@@ -27,7 +27,7 @@ class EvalNeverWorse(Experiment):
     drives: Annotated[tuple[str, ...], Positional] = ()
     """NAME@HZ=DATASET for each drive."""
     decimated: tuple[str, ...] = ()
-    """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
+    """NAME@HZ=DATASET for each drive that is coded at a fifth of its rate: every fifth frame."""
     effort: str = DEFAULT_EFFORT
     """Effort of our coder: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: Preset = "veryfast"

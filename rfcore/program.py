@@ -1,7 +1,8 @@
-"""Run a command-line program of the project: parse, run one verb, report errors.
+"""Run a command-line program of the project: parse, work, report errors.
 
-A verb is one frozen dataclass, its options (their docstrings are the ``--help``), with a ``run``
-method. Heavy imports happen inside ``run``, so that ``--help`` is immediate.
+Options are the fields of frozen dataclasses, their docstrings are the ``--help``; a boolean is
+false by default, and its text says what the flag does. A verb is such a class with a ``run``
+method. Heavy imports happen when work begins, so that ``--help`` is immediate.
 A user's mistake ends in one line on stderr and exit status 2, never in a traceback.
 """
 
@@ -10,18 +11,21 @@ from __future__ import annotations
 import inspect
 import io
 import os
+import re
 import select
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import cache
 from importlib.metadata import version
-from typing import Protocol
+from typing import Any, Protocol
 
+import tyro
 from tyro.conf import (
     DisallowNone,
     EnumChoicesFromValues,
     FlagCreatePairsOff,
+    OmitArgPrefixes,
     OmitSubcommandPrefixes,
     PositionalMetavarFromFieldName,
 )
@@ -29,6 +33,7 @@ from tyro.conf import (
 from rfcore.errors import RfedgeError
 
 CONFIG = (
+    OmitArgPrefixes,
     OmitSubcommandPrefixes,
     DisallowNone,
     EnumChoicesFromValues,
@@ -61,13 +66,24 @@ class Verb(Protocol):
         """Run the command."""
 
 
-def run_program(name: str, parse: Callable[[], Verb]) -> int:
-    """Parse the command line with ``parse``, run the verb, and return the exit status."""
+def parse_options(
+    kind: Any, name: str, arguments: Sequence[str] | None = None, description: str | None = None
+) -> Any:
+    """Return the options of program ``name`` as a ``kind``, one class or a union of verbs.
+
+    They come from ``arguments``, by default those of this process. Prints help, or what is wrong
+    with them, and raises ``SystemExit``.
+    """
     _wrap_help_as_paragraphs()
+    return tyro.cli(kind, prog=name, description=description, args=arguments, config=CONFIG)
+
+
+def run_program(name: str, work: Callable[[], None]) -> int:
+    """Do ``work``, which begins with parsing the command line, and return the exit status."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # so that a log file gets each line at once
         sys.stdout.reconfigure(line_buffering=True)
     try:
-        return _run(name, parse)
+        return _run(name, work)
     except BrokenPipeError as error:
         if not _nobody_reads():
             print(f"{name}: {error}", file=sys.stderr)
@@ -80,8 +96,8 @@ def run_program(name: str, parse: Callable[[], Verb]) -> int:
 def _wrap_help_as_paragraphs() -> None:
     """Let tyro wrap the docstring of an option as one paragraph.
 
-    tyro 1.0 breaks it where the source does, because it does not remove the indentation of the
-    docstring's further lines. Another version without this function keeps its own line breaks.
+    tyro 1.0 breaks it where the source does. Another version without this function keeps its own
+    line breaks.
     """
     module, name = sys.modules.get("tyro._docstrings"), "parse_docstring_from_object"
     parse = getattr(module, name, None)
@@ -89,9 +105,13 @@ def _wrap_help_as_paragraphs() -> None:
         return
 
     def cleaned(documented: object) -> dict[str, str]:
-        return {option: inspect.cleandoc(text) for option, text in parse(documented).items()}
+        return {option: _paragraphs(text) for option, text in parse(documented).items()}
 
     setattr(module, name, cleaned)
+
+
+def _paragraphs(text: str) -> str:
+    return re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.cleandoc(text))
 
 
 def _nobody_reads() -> bool:
@@ -101,13 +121,12 @@ def _nobody_reads() -> bool:
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
-def _run(name: str, parse: Callable[[], Verb]) -> int:
+def _run(name: str, work: Callable[[], None]) -> int:
     if sys.argv[1:] == ["--version"]:
         print(f"{name} {version('rfedge')}")
         return 0
-    verb = parse()
     try:
-        verb.run()
+        work()
     except BrokenPipeError:
         raise
     except (RfedgeError, OSError) as error:
