@@ -57,11 +57,11 @@ class VehicleCameras(Protocol):
 
     @property
     def positions(self) -> tuple[Position, ...]:
-        """Where the vehicle is at each place of the drive."""
+        """Positions of the vehicle at each place of the drive."""
 
     @property
     def schedule(self) -> CaptureSchedule:
-        """When pictures are captured."""
+        """Schedule of the captures."""
 
     def __len__(self) -> int:
         """Return the number of places on the drive."""

@@ -51,7 +51,7 @@ class RateLimit:
     def __init__(self) -> None:
         self.period_s = 0.0
         self.open_s = float("-inf")
-        """When the next capture is allowed."""
+        """Time from which the next capture is allowed."""
 
     def set_hz(self, rate_hz: float) -> None:
         """Allow ``rate_hz`` captures per second from now on."""

@@ -31,7 +31,7 @@ class AgentLimits:
     stall_s: Annotated[float, Suppress] = 1.0
     """Longest pause of a server beyond its usual time."""
     give_up_s: Annotated[float, arg(name="give-up-s")] = 0.0
-    """How many seconds without any server before the drive ends with an error; 0: never."""
+    """Seconds without any server after which the drive ends with an error; 0: never."""
     drain_s: Annotated[float, Suppress] = 5.0
     """Longest time for the last frames, after ``stop`` and at the end of the drive."""
     slot_frames: Annotated[int, Suppress] = 1

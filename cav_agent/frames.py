@@ -150,7 +150,7 @@ class RetryReason(StrEnum):
 
 @dataclass(frozen=True)
 class StreamEnd:
-    """Why a stream to a server ended; ``problem`` is for the log."""
+    """Reason why a stream to a server ended; ``problem`` is for the log."""
 
     reason: EndReason
     problem: str

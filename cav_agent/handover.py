@@ -80,7 +80,7 @@ def _stays(tile: Tile, position: Position) -> bool:
 
 
 class HandoverCause(StrEnum):
-    """Why a picture goes to another tile than the one before."""
+    """Reason why a picture goes to another tile than the one before."""
 
     TILE = "tile"
     SERVER_LOST = "server_lost"

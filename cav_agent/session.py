@@ -147,7 +147,7 @@ class AgentSession:
 
     @property
     def waits_for(self) -> str:
-        """What keeps a picture from being sent or answered; "" for nothing, or no connection."""
+        """The reason why a picture is not sent or answered; "" for none, or no connection."""
         if self.state is LinkState.GREETING:
             return "the server's welcome"
         if self.state is LinkState.DISCONNECTED or self.is_idle:

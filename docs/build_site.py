@@ -67,7 +67,7 @@ API: Mapping[str, Sequence[str]] = {
     "Sizes of uplinks": ("rfedge.sizing.estimate",),
     "Errors": ("rfcore.errors",),
 }
-"""What a program that uses the library needs, by topic: names of modules, classes, functions."""
+"""Names of the public classes and functions, by topic."""
 
 FORMATS: Mapping[str, str] = {
     "Field archives, `.rff`": "rfcore.field.archive",

@@ -22,11 +22,11 @@ OUT = ROOT / "docs" / "images" / "frame.jpg"
 DRIVE = ROOT / "samples" / "street" / "transforms_drive_vehicles.json"
 FIELD = ROOT / "samples" / "fields" / "street.rff"
 FRAME = 12
-"""Which picture of the drive: one with parked and moving vehicles."""
+"""Index of the picture in the drive: one with parked and moving vehicles."""
 CRF = 23.0
-"""Of `rfedge demo`."""
+"""Quality that `rfedge demo` codes at."""
 GAIN = 3
-"""Of the difference, around mid-grey."""
+"""Factor by which the drawn difference is amplified around mid-grey."""
 
 
 def main() -> None:

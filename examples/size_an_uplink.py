@@ -1,6 +1,6 @@
-"""How many vehicles a cell carries, over quality: python examples/size_an_uplink.py
+"""Plot the vehicles that a cell carries over quality: python examples/size_an_uplink.py
 
-What ``rfedge size`` prints, from Python (docs/how-to/sizing.md says how).
+This is what ``rfedge size`` prints, from Python (docs/how-to/sizing.md says how).
 """
 
 from dataclasses import replace

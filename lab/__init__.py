@@ -1,1 +1,1 @@
-"""What proves rfedge: experiments, loads of several servers, city plans, recorded results."""
+"""Experiments, loads of several servers, city plans and recorded results of rfedge."""

@@ -32,8 +32,7 @@ from rfedge.samples import sample_path
 Amount = TypeVar("Amount", int, float)
 
 MAX_SLOPE_MB = 1.0
-"""Per minute."""
-
+"""Largest growth of memory, MB a minute."""
 LEAST_SHARE = 0.5
 """Share of the frames that were due; with fewer reconstructed the server was not at half load."""
 

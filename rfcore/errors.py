@@ -74,7 +74,7 @@ class UnknownField(RfedgeError):
 
 
 class RejectReason(StrEnum):
-    """Why a delta packet was refused. The wire's Nack carries the same names."""
+    """Reason why a delta packet was refused. The wire's Nack carries the same names."""
 
     STALE_EPOCH = "stale_epoch"
     STALE_SEQUENCE = "stale_sequence"

@@ -125,15 +125,15 @@ def decode_promised(
 
 @dataclass(frozen=True)
 class CodingSettings:
-    """How the P pictures of a drive are coded."""
+    """Settings with which the P pictures of a drive are coded."""
 
     effort: str = DEFAULT_EFFORT
     crf: float = 23.0
     """Constant rate factor, 1..51."""
     qp_map: QpMap | None = None
-    """Where in the picture frames are coded finer or coarser."""
+    """Parts of the picture that are coded finer or coarser."""
     check_decode: bool = False
-    """As in ``DeltaEncoder``."""
+    """Decode each slice and compare it, as ``DeltaEncoder`` does."""
     light: LightChange = LightChange.AUTO
     """Whether the light of renders is changed where that saves bits."""
 

@@ -21,7 +21,7 @@ MEASURED_AGAIN = pytest.mark.flaky(reruns=AGAIN, only_rerun=[NotQuiet.__name__])
 
 
 class Host:
-    """What others took of the machine from the moment on in which this was made."""
+    """Processor time that others took of the machine since this was made."""
 
     def __init__(self) -> None:
         self._begin = _seconds()

@@ -1,4 +1,4 @@
-"""What a server recorded, for tests."""
+"""Recordings of a server, for tests."""
 
 from pathlib import Path
 

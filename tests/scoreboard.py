@@ -21,7 +21,7 @@ Row = dict[str, Any]
 
 @dataclass(kw_only=True)
 class Figures:
-    """What a case measured, each figure beside its bound; one broken off does not hold."""
+    """Figures of a case, each beside its bound; a case that was broken off does not hold."""
 
     bounds: list[str] = field(default_factory=list)
     measured: list[str] = field(default_factory=list)

@@ -111,7 +111,7 @@ def imports_of(source: str) -> list[tuple[str, int, str]]:
 
 
 def problem_of(package: str, extra: str) -> str | None:
-    """What is wrong with an import of ``package`` under the guard of ``extra`` ("": under none)."""
+    """Return the error of importing ``package`` under the guard of ``extra`` ("": under none)."""
     if package in PACKAGES:
         return "is ours: keep it out of the guard" if extra else None
     if extra and extra not in EXTRAS:

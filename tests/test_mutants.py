@@ -1,4 +1,4 @@
-"""What would make a figure wrong is noticed by a test: each change of one line, by the one named.
+"""A change of one line that makes a figure wrong fails the test named beside it.
 
 The first eight are those of an audit that no fast test noticed then.
 """

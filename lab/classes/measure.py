@@ -165,7 +165,7 @@ class ClassQuality:
     equal: str
     """The quantity that all coders share: ``bits``, or ``quality`` of the whole picture."""
     at_db: float
-    """That quality; for equal bits, the one that our coder has for them."""
+    """The quality of the comparison; for equal bits, that of our coder."""
     bytes_per_frame: float
 
     def row(self) -> dict[str, Any]:

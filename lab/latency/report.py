@@ -59,7 +59,7 @@ class PlayedRow:
     share_within: Mapping[str, float]
     """Share of the frames that came in time, by the budget in ms."""
     network_quantiles_ms: Sequence[float | None]
-    """At equal steps of the share, from 0 to 1."""
+    """Quantiles of the network latency at equal steps of the share, from 0 to 1."""
 
 
 @dataclass(frozen=True)

@@ -158,7 +158,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Per frame: bytes sent, whether it became a new picture, and what was shown, as SSIM."""
+    """The bytes of each frame, whether it became a new picture, and the SSIM of what was shown."""
 
     frame_bytes: tuple[int, ...]
     new: tuple[bool, ...]

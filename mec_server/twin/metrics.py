@@ -13,7 +13,7 @@ from rfcore.wire.twin import PictureEncoding
 
 
 class ConsumerEnd(StrEnum):
-    """Why a consumer's stream ended."""
+    """Reason why a consumer's stream ended."""
 
     LEFT = "left"
     SLOW = "slow"

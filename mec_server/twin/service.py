@@ -89,7 +89,7 @@ class ConsumerAccess:
     check_vehicles: Callable[[frozenset[str]], None]
     may_draw: Callable[[str], bool]
     may_see: str = ""
-    """What the consumer may see in words; "" for everything."""
+    """Words for the part of the twin that the consumer may see; "" for everything."""
 
 
 class ConsumerStream:

@@ -21,7 +21,7 @@ from rfcore.confinement.confine import WHILE_STARTING, Confinement, Refusal, ass
 from rfcore.errors import BackendUnavailable
 
 SYSTEM = ("/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache")
-"""What programs need of the system; read-only in a sandbox."""
+"""Parts of the system that programs need; a sandbox has them read-only."""
 
 NAMESPACES = (
     *("--unshare-ipc", "--unshare-pid", "--unshare-net", "--unshare-uts", "--unshare-cgroup-try"),

@@ -45,13 +45,13 @@ from rfcore.views import PosedPicture
 RIG_FILE = "rig.toml"
 
 MAX_RIG_CAMERAS = 32
-"""As many as one Hello may name (``rfcore.wire.values.MAX_CAMERAS``)."""
+"""Number of cameras that one Hello may name (``rfcore.wire.values.MAX_CAMERAS``)."""
 
 FARTHEST_M = 100.0
 """A camera further from the rig's origin is on another vehicle."""
 
 AGREE_M, AGREE_RAD = 0.1, math.radians(1.0)
-"""How far a drive's own pose may be from the one that extrinsics and the reference's pose give."""
+"""Largest difference between a drive's pose and the one that extrinsics and reference give."""
 
 KEYS = ("name", "drive", "source", "camera_file", "camera_from_rig", "priority", "mask")
 

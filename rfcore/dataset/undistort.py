@@ -30,7 +30,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SourceMap:
-    """For each output pixel the four source pixels around its origin and how much each counts."""
+    """The four source pixels around each output pixel's origin, and their weights."""
 
     corner: NDArray[np.intp]
     right: F32

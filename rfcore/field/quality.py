@@ -42,7 +42,7 @@ MAX_SAMPLES_PER_RAY = 4096
 
 @dataclass(frozen=True)
 class Quality:
-    """How a field is drawn; raises ``InvalidInput`` for values out of range."""
+    """Quality at which a field is drawn; raises ``InvalidInput`` for values out of range."""
 
     detail: float = 1.0
     """Share of the splats: 1, 0.5, 0.25 or 0.1, the most important ones first."""

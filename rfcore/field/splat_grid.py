@@ -49,7 +49,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Grain:
-    """How finely a writer places splats; readers need not know it.
+    """Precision at which a writer places splats; readers need not know it.
 
     A step of means is at most ``2^-means_bits`` of the block's smaller widths; rotations are
     multiples of ``rotation`` of their steps.

@@ -173,7 +173,7 @@ class OutageTransmission:
 
 
 class JitterDistribution(StrEnum):
-    """How the delay is drawn."""
+    """The distribution that delays are drawn from."""
 
     UNIFORM = "uniform"
     EXPONENTIAL = "exponential"
@@ -232,7 +232,7 @@ UNBOUNDED_BYTES = 2**62
 MAX_QUEUE_KIB = 1 << 20
 LIFE_S = Range(0.05, 1e6)
 IMPAIRMENTS = ("outage", "delay_trace", "jitter")
-"""In the order in which they act, whatever the order in the file; a trace is in place of a rate."""
+"""Impairments in the order in which they act, not that of the file; a trace replaces a rate."""
 
 
 NO_LOSS = PacketLoss(0.0)

@@ -100,7 +100,7 @@ class ConstantRate:
 
 @dataclass(frozen=True)
 class LinkParts:
-    """What transmits on a link, and what adds to its delay."""
+    """The transmitter of a link, and the sources of its delay."""
 
     transmission: Transmission
     delays: tuple[Delay, ...] = ()

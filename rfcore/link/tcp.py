@@ -90,8 +90,10 @@ class Sent:
 
 @dataclass(frozen=True)
 class AckPacket:
-    """What a receiver has: everything below ``upto``, ``ranges`` beyond it; ``is_repeated``: it got
-    something that it had."""
+    """States that a receiver has everything below ``upto``, and ``ranges`` beyond it.
+
+    ``is_repeated``: it got something that it had.
+    """
 
     upto: int
     ranges: tuple[tuple[int, int], ...] = ()
@@ -99,7 +101,7 @@ class AckPacket:
 
 
 class Phase(Enum):
-    """What the sender is at."""
+    """Phase of the sender."""
 
     OPEN = auto()
     RECOVERY = auto()
@@ -107,7 +109,7 @@ class Phase(Enum):
 
 
 class Timer(Enum):
-    """What happens when the timer runs out."""
+    """Action when the timer runs out."""
 
     RTO = auto()
     PROBE = auto()

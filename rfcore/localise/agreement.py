@@ -29,16 +29,16 @@ BLUR_PX = 3.0
 NEAR_PX = 8
 """Displacements up to this are not chance: a picture resembles its own neighbourhood."""
 ON_THE_SPOT_PX = 1
-"""How far from zero displacement a picture may resemble the render at its own pose best."""
+"""Largest displacement from the render at its own pose at which a picture may fit best."""
 LEAST_SHOWN = 0.2
 """Share of the picture that the field must show for the comparison to mean anything."""
 ASIDE_SHARES = ((-0.2, -0.12, -0.06, 0.06, 0.12, 0.2), (-0.19, -0.11, -0.05, 0.05, 0.11, 0.19))
 """Displacements that stand for chance, down and across, as shares of the picture's sides."""
 BLOCK_PX, LEAST_BLOCK_PX = 24, 8
-"""Sides of the squares whose place is looked for, pixels of half the resolution: a fifth of the
+"""Sides of the blocks whose place is searched, pixels of half the resolution: a fifth of the
 picture's shorter side, within these bounds."""
 BLOCK_REACH_PX = 6
-"""How far a block is looked for, pixels of half the resolution."""
+"""Distance within which a block is searched, pixels of half the resolution."""
 LEAST_BLOCK_SHOWN = 0.9
 """Share of a block that the field must show."""
 

@@ -42,14 +42,14 @@ Places = tuple[NDArray[np.intp], NDArray[np.intp]]
 """Rows and columns [N] of pixels."""
 
 NEARBY_PX = 15
-"""Pixels take part whose gradient is above the mean of such a square around them."""
+"""Pixels take part whose gradient is above the mean of a square of this side around them."""
 LEAST_GRADIENT = np.float32(0.1)
-"""By how much above, in units of the structure a pixel; less is noise."""
+"""Least excess of the gradient over that mean, in units of the structure a pixel; less is noise."""
 FINEST_PIXELS, COARSE_PIXELS = 6000, 3000
-"""At most so many pixels take part in the finest level, and in any other. With half as many in the
+"""Largest number of pixels of the finest level, and of any other. With half as many in the
 others a picture predicted far off was aligned where it is not (hypothesis found it)."""
 MAX_STEPS = 8
-"""Per level."""
+"""Largest number of steps of a level."""
 CONVERGED_PX = 0.03
 """A step that moves pixels of middling depth by less ends a level."""
 MIN_PIXELS = 60
@@ -57,11 +57,11 @@ MIN_PIXELS = 60
 NEAREST_OF_MEDIAN = 0.02
 """Share of the median depth that points must lie away: nearer ones are in the camera."""
 MIN_CONFIDENCE = 0.5
-"""Of a pixel that takes part (``rfcore.views``): none where depth breaks."""
+"""Least confidence of a pixel that takes part (``rfcore.views``); it is 0 where depth breaks."""
 MEDIAN_OF_EVERY = 7
 """A median of every seventh depth is good enough."""
 LEAST_SPREAD = 0.02
-"""Of residuals of the structure, whose values lie about -2..2."""
+"""Least spread of residuals; values of the structure lie about -2..2."""
 TINY = np.float32(1e-6)
 
 

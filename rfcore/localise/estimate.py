@@ -1,4 +1,4 @@
-"""What a tracker is given and what it answers: measurements and priors; states and poses.
+"""Inputs and outputs of a tracker: measurements and priors; states and poses.
 
 This needs no extra, so pipelines, metrics and logs that pass answers on do not import OpenCV.
 
@@ -36,11 +36,11 @@ REACH_DEG = 12.0
 """Yaw between hypotheses; of a field of view of 60 degrees or more, four fifths stay in view."""
 MOST_RINGS = 3
 MOST_TURNS = 2
-"""At most so many rings, and so many turns to each side: never more than 185 hypotheses."""
+"""Limits of rings, and of turns to each side: never more than 185 hypotheses."""
 AROUND = 6
 """Poses of the innermost ring; the n-th has n times as many."""
 PLAUSIBLE = 4.0
-"""How many standard deviations a pose may lie from the prior; more refutes it."""
+"""Standard deviations that a pose may lie from the prior; more refutes it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class PoseMeasurement:
     """
 
     time_ns: int
-    """When the camera was there, nanoseconds of the Unix epoch."""
+    """Time of the pose, nanoseconds of the Unix epoch."""
     position_m: Vec3
     """Position of the camera's centre in the tile's frame: east, north, up."""
     position_std_m: Vec3

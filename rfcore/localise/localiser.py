@@ -65,7 +65,7 @@ class LocaliserSettings:
     """
 
     features: int = 2000
-    """At most so many features of the picture, and as many of a render."""
+    """Largest number of features of the picture, and of a render."""
     ratio: float = 0.8
     """A match is kept if its distance is below this share of the second nearest's."""
     least_confidence: float = 0.5

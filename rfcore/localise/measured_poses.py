@@ -146,7 +146,7 @@ COMPARED_S = 1.5
 """A measurement further than this from the last tracked picture shows no bias."""
 SAME_TIME_NS = 50_000_000
 UNKNOWN_SPEED_M_S = 10.0
-"""Where no motion is known, an old measurement widens the search so fast."""
+"""Speed at which an old measurement widens the search where no motion is known."""
 OUTSIDE_M = 50.0
 """A measurement further than this outside the field's bounds is no place to search."""
 LEAST_M, LEAST_DEG = 0.3, 1.5

@@ -36,13 +36,13 @@ LEAST_ON_THE_SPOT = 0.4
 """Share of the nearer half of the picture that must lie where the render has it, for a track to
 begin (``near_on_the_spot``)."""
 EXPECTED_OF_DEPTH, EXPECTED_DEG = 0.02, 0.7
-"""How far a prediction is off, one sigma: a share of the median depth (0.2 m in a street)."""
+"""Error of a prediction, one sigma: a share of the median depth (0.2 m in a street)."""
 DRIFT_OF_MOTION = 0.2
 """Share of the motion since the last picture that a prediction may be wrong by."""
 UNKNOWN_SPEED_M_S = 10.0
 """While only one pose is known, the next one may be this far."""
 SETTLED_OF_DEPTH, SETTLED_DEG = 0.003, 0.05
-"""How far a pose that was rendered at is expected to be off, one sigma."""
+"""Expected error of a pose that was rendered at, one sigma."""
 REDRAW_PX = 0.25
 """A correction that moves the pixels that were aligned by more is worth another render."""
 FIRST_STEP_PX, MOST_PX = 0.4, 3.0
@@ -52,7 +52,7 @@ FIRST_STEP_RENDERS = 2
 """Renders more for the first picture after a track began, at least: it has not seen yet how the
 camera moves, so the pose found may be far from the one to be found."""
 FINE_LEVELS = 1
-"""At so many of the finest levels that take part the pose that was rendered at is corrected."""
+"""Number of the finest levels at which the pose that was rendered at is corrected."""
 LONGEST_GAP_S = 1.5
 """Over longer times no motion is predicted."""
 UNKNOWN_AHEAD = (0.0, 0.03, 0.06, 0.1, 0.15)
@@ -68,10 +68,10 @@ RenderAt = Callable[[Pose], FieldView]
 
 @dataclass(frozen=True)
 class TrackingBudget:
-    """What tracking a frame may cost beyond the render at the pose sent."""
+    """Limits of what tracking a frame costs beyond the render at the pose sent."""
 
     renders: int = 1
-    """At most so many further renders."""
+    """Largest number of further renders."""
     finest: int = 0
     """The finest level of the pyramids that takes part."""
 

@@ -68,7 +68,7 @@ CARRY_ALIGNMENTS = 2
 RECENT_S = 3.0
 """A pose known so long ago still tells where to search."""
 RECENT_M, RECENT_DEG, RECENT_DEG_PER_S = 0.5, 1.5, 4.0
-"""How far a camera that was just seen is from where it is expected: one sigma, and its growth."""
+"""Error of the expected pose of a camera that was just seen: one sigma, and its growth."""
 
 
 ONE_MORE_RENDER = TrackingBudget(1)

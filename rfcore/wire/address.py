@@ -87,9 +87,9 @@ REMEDIES = {
     64: "make one for this host (rfedge certs init --replace --hosts)",  # ..._IP_ADDRESS_MISMATCH
 }
 OTHER_AUTHORITY = "both ends need certificates and --tls-ca of one authority (rfedge certs add)"
-"""What to do about a certificate that is refused, by OpenSSL's code; ``OTHER_AUTHORITY`` else."""
+"""Remedy for a certificate that is refused with any other of OpenSSL's codes."""
 NOT_TLS = frozenset({"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "PACKET_LENGTH_TOO_LONG"})
-"""How OpenSSL calls an answer that is not a TLS record."""
+"""OpenSSL's names for an answer that is not a TLS record."""
 
 
 def check_handshake(address: Address, tls: TlsFiles | None) -> str:

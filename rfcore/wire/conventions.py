@@ -95,13 +95,13 @@ SERVER_OPTIONS: Final[Options] = (
     # A vehicle or consumer has a handful; a proxy opens another connection. What one connection may
     # have at once, the event loop has to answer before it comes to anybody else.
     ("grpc.max_concurrent_streams", 64),
-    # By default a peer may take two minutes over its handshake, and hold a connection for it; and
+    # A peer may take two minutes by default over its handshake, and hold a connection for it; and
     # there may be any number of connections.
     ("grpc.server_handshake_timeout_ms", 5_000),
     # A peer that shakes hands and then asks for nothing does not keep its connection.
     ("grpc.max_connection_idle_ms", 15_000),
     ("grpc.max_allowed_incoming_connections", 1_024),
-    # What is read at once is parsed at once, and its calls are answered before anybody else's: of
-    # calls whose headers are 13 kB and become 17 MB (an HPACK bomb) it shall be few.
+    # Bytes that are read at once are parsed at once, and their calls are answered before those of
+    # others: few calls shall fit whose headers are 13 kB and become 17 MB (an HPACK bomb).
     ("grpc.experimental.tcp_max_read_chunk_size", 16_384),
 )

@@ -153,14 +153,14 @@ PROCESS_FAMILIES = (
     ),
     ("process_virtual_memory_bytes", "gauge", "Virtual memory size in bytes."),
 )
-"""What prometheus_client's own ``ProcessCollector`` adds on Linux."""
+"""Metrics that prometheus_client's own ``ProcessCollector`` adds on Linux."""
 
 
 MAX_SCRAPES = 8
 """Connections that are served at once; each takes a thread, further ones are closed."""
 
 SCRAPE_S = 5.0
-"""How long one may take, from its connection on."""
+"""Longest time of a scrape, from its connection on."""
 
 
 class _BoundedServer(ThreadingHTTPServer):

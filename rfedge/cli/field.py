@@ -207,7 +207,7 @@ class FieldCheck:
     out: Annotated[Path, arg(metavar="FILE.png")] = Path("out/field-check.png")
     """The four pairs, as PNG."""
     fix: Annotated[Path | None, RFF] = None
-    """Where to write the field in the frame and mode that fit."""
+    """File to write with the field in the frame and mode that fit."""
     threads: int = 2
     """Threads of the renderer."""
 

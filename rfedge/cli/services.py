@@ -1,4 +1,4 @@
-"""What runs beside the services: ``rfedge watch`` and ``rfedge certs``."""
+"""Commands beside the services: ``rfedge watch`` and ``rfedge certs``."""
 
 from __future__ import annotations
 

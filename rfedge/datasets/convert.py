@@ -128,7 +128,7 @@ class SplitTile:
     name: str
     area_m: Area
     margin_m: float
-    """How far beyond its ground its pictures reach."""
+    """Distance beyond its ground that its pictures reach."""
     pictures: tuple[int, ...]
     """Indices in the recording."""
     neighbours: tuple[str, ...]

@@ -163,7 +163,7 @@ class ModeFit:
     """PSNR of a field's splats in either mode, under the convention that fits best."""
 
     stated_antialiased: bool
-    """What the field's metadata says."""
+    """Value that the field's metadata states."""
     antialiased_db: float
     default_db: float
 

@@ -37,7 +37,7 @@ DIRECTIONS = 8
 GRID_STEPS = (0.0, -0.25, 0.25, -0.5, 0.5, -0.75, 0.75)
 """Places along each horizontal axis, in units of the field's radius, the middle first."""
 NEXT_OF_DEPTH, NEXT_DEG = 0.15, 8.0
-"""How far the next picture may be from the last: a share of the median depth, and degrees."""
+"""Largest step from one picture to the next: a share of the median depth, and degrees."""
 AGAIN_AFTER = 3
 
 

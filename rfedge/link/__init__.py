@@ -31,9 +31,9 @@ class LinkSettings:
     """Forward TCP between a vehicle and a server at a limited throughput and with a delay."""
 
     to: Annotated[str, ADDRESS]
-    """Where to connect for each accepted connection, HOST:PORT."""
+    """Address to connect to for each accepted connection, HOST:PORT."""
     listen: Annotated[str, ADDRESS] = "127.0.0.1:0"
-    """Where to accept connections, HOST:PORT; port 0 takes a free one."""
+    """Address to accept connections on, HOST:PORT; port 0 takes a free one."""
     also: Annotated[tuple[str, ...], arg(metavar="LISTEN=TO ...")] = ()
     """Further servers over the same link, each LISTEN=TO: a radio link shared by several paths."""
     profile: Annotated[Path | None, arg(metavar="FILE.toml")] = None

@@ -35,7 +35,7 @@ INTERNAL, UNAVAILABLE, UNKNOWN = 13, 14, 2
 
 @dataclass(frozen=True)
 class Status:
-    """How the server ended the call: gRPC's status code and its text."""
+    """gRPC's status code and text with which the server ended the call."""
 
     code: int
     details: str

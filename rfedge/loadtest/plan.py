@@ -252,9 +252,9 @@ class VehicleReport:
     granted_hz: float = 0.0
     """Rate that the server admitted; 0: any."""
     refused: str = ""
-    """Why the server did not admit the vehicle; empty if it did."""
+    """Reason why the server did not admit the vehicle; empty if it did."""
     failed: str = ""
-    """Why the vehicle lost its stream; empty if it did not."""
+    """Reason why the vehicle lost its stream; empty if it did not."""
 
     def on_time(self, deadline_ms: float) -> int:
         """Return how many pictures were acknowledged within the deadline."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 PAGE_COLUMNS = 8
-"""At most so many columns of a page's table fit a screen."""
+"""Largest number of columns that fit a screen."""
 BORDER = 2
 """Spaces between the columns of a terminal's table."""
 SHOWN = "shown"

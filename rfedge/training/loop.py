@@ -29,7 +29,7 @@ MAX_MINUTES = 7 * 24 * 60.0
 
 @dataclass(frozen=True)
 class LoopLimits:
-    """When a run ends, and how often it writes a checkpoint and measures."""
+    """The end of a run, and the intervals of its checkpoints and measurements."""
 
     minutes: float | None = None
     """Length of the whole run, instead of the trainer's iterations."""

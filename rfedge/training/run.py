@@ -45,7 +45,7 @@ from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """How far the pictures' poses moved, and the refined cameras."""
+    """The refined cameras, and the distances by which their poses moved."""
 
     median_m: float
     p95_m: float

@@ -157,7 +157,7 @@ def _lines(
 
 @dataclass(frozen=True)
 class Settings:
-    """Where a scene's pictures go, and what renders them how finely."""
+    """Folder of a scene's pictures, their renderer and its precision."""
 
     out: Path
     samples: int = 16

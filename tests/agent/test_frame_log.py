@@ -1,4 +1,4 @@
-"""What is recorded of a drive: a line per picture, log lines for what went wrong, and metrics."""
+"""A drive is recorded as a line per picture, log lines for what went wrong, and metrics."""
 
 import json
 from collections.abc import Callable

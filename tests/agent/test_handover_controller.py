@@ -121,13 +121,13 @@ class Site:
     failing_fields: dict[ServedTile, Exception] = field(default_factory=dict)
     clients: dict[ServedTile, list[MemoryClient]] = field(default_factory=dict)
     streaming: dict[int, set[ServedTile]] = field(default_factory=dict)
-    """Who had a stream when a picture was captured."""
+    """The tiles that had a stream when a picture was captured."""
     breaks_at: int | None = None
     """The picture at which the stream that takes it is refused, once it was answered."""
     drains_at: int | None = None
     """The picture at which the server of the stream that takes it begins to drain."""
     failing: int = 0
-    """How many streams after a tile's first one are refused at once."""
+    """Number of streams after a tile's first one that are refused at once."""
 
     async def prepare(self, served: ServedTile) -> OpenStream:
         if served in self.failing_fields:

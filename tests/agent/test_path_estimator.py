@@ -1,4 +1,4 @@
-"""What a path takes is learnt from answers: against a path whose truth is known."""
+"""The throughput of a path is learnt from answers: against a path whose truth is known."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""What waits for the encoder, what for an answer, and what the next frame is predicted from."""
+"""Frames wait for the encoder, then for an answer; the next is predicted from one of them."""
 
 from collections.abc import Callable
 from dataclasses import replace

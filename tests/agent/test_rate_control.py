@@ -50,7 +50,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Picture:
-    """What became of one captured picture."""
+    """The fate of one captured picture."""
 
     captured_s: float
     delay_s: float | None

@@ -68,7 +68,7 @@ class Attack:
 
 
 EFFECT = {LOG_LINES: 2.0, OPEN_FILES: 1.2, PROCESSOR_S: 1.1}
-"""How many times as much; of counters, which stand still otherwise, ``MUCH``."""
+"""Factor of growth that is an effect; ``MUCH`` for counters, which stand still otherwise."""
 MUCH = 2.0
 
 

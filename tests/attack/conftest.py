@@ -44,7 +44,7 @@ FIELD = ROOT / "samples/fields/street.rff"
 ATTACKER, BYSTANDER = ("-m", "attack.attacker"), ("-m", "attack.bystander")
 (MAX_FIELD,) = (word for word in SERVER["command"] if word.startswith("--max-field-gb="))
 ROUNDS = 2
-"""How often calm, control and attack take turns."""
+"""Number of turns of calm, control and attack."""
 ALLOWANCE_MS = 10.0
 SCRAPE_S = 5.0
 REPORT_S = 30.0
@@ -107,7 +107,7 @@ class Scene(Figures):
     p99_ms: float = 0.0
     consumer_p99_ms: float = 0.0
     newcomer_s: float | None = None
-    """Of the slowest under attack; None: one was never shown, or none came."""
+    """Time of the slowest newcomer under attack; None: one was never shown, or none came."""
 
     def about(self, name: str, what: str, identity: str) -> None:
         """Say what is done, and with whose certificate."""

@@ -27,7 +27,8 @@ ATTACKERS_CRF = 24.0
 """No other vehicle of the suite codes so, and no slice of theirs is equal to one of the attacker's.
 """
 SEARCHED_BYTES = 1 << 20
-"""Of a decoder's memory: a render of 640x360 as I_PCM takes 354 kB, and the slice stands behind."""
+"""Size of the searched part of a decoder's memory: a render of 640x360 as I_PCM takes 354 kB, and
+the slice stands behind it."""
 
 
 def picture(target: Target, cameras: int = 1) -> tuple[Hello, Frame]:

@@ -1,4 +1,4 @@
-"""What is attacked, and what attacks are made of: channels, messages, repetition."""
+"""The target of attacks, and their parts: channels, messages, repetition."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ VEHICLE = "attacker"
 
 @dataclass(frozen=True)
 class Target:
-    """Whom to attack. Of a decoy, everything is its own: what is done to it costs the server
-    nothing but the machine's time."""
+    """The server to attack, or a decoy beside it: an attack on that costs the server nothing but
+    the machine's time."""
 
     address: str
     """HOST:PORT of the services."""

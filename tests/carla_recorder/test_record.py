@@ -177,7 +177,7 @@ def test_the_rig_has_18_cameras_in_three_rows():
 
 
 def test_the_labels_and_calls_exist_in_the_client_library():
-    """What the stand-in answers is what the library offers."""
+    """The stand-in answers only what the library offers."""
     for name in ("Car", "Truck", "Bus", "Motorcycle", "Bicycle"):
         assert hasattr(carla.CityObjectLabel, name)
     for owner, names in {

@@ -24,7 +24,7 @@ from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContra
 SIZE_PX = (64, 48)
 WALL_M = 10.0
 SHIFT_PX = 3.0
-"""By which the picture moves between frames; the camera moves along a wall."""
+"""Motion of the picture between frames; the camera moves along a wall."""
 
 LIGHT = (4096, 0, 0, 32, 0, 4096, 0, 0, 0, 0, 4096, 0)
 """Two levels brighter."""

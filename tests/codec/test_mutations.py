@@ -316,7 +316,7 @@ def test_every_kind_of_damage_changes_something(adapting):
 
 
 def test_a_picture_that_is_not_the_senders_is_noticed(stream):
-    """What is shown is compared with the digest that was sent."""
+    """The digest that was sent is compared with the picture that is shown."""
     first = stream.frames[1]
     other = replace(first.packet, reconstruction_digest=bytes(6))
     poisoned = replace(stream, frames=(replace(first, packet=other),))

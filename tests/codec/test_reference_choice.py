@@ -1,4 +1,4 @@
-"""What the sender decides: references by their use, light only when it pays."""
+"""The sender orders references by their use, and changes light only when it pays."""
 
 from dataclasses import replace
 

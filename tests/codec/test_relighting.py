@@ -140,7 +140,7 @@ def test_a_receiver_whose_renderer_is_not_exact_refuses():
 SMALL_PX = (160, 96)
 CRFS = (22.0, 30.0)
 MESSAGE_BYTES = 100
-"""Of a frame's message besides its slice, about."""
+"""Approximate size of a frame's message without its slice."""
 WINDOW = 20
 OFF = FrameChoice(photometric=(), relight=False)
 NOISE = 1.01

@@ -100,7 +100,7 @@ def scene(kind: str, size: Size, references: int, seed: int) -> tuple[I420, list
 
 
 def decoded(size: Size, coded: OwnSlice, references: Sequence[I420]) -> I420:
-    """What the product's receiver makes of the slice, its check of payloads included."""
+    """Return the picture that the product's receiver decodes, with its check of payloads."""
     decoder = SpliceDecoder(stream_header(CodecConfig(*size)))
     decoder.check_payload(coded.payload, len(references))
     decoder.predict_from(*references)

@@ -1,4 +1,4 @@
-"""What is wrong with a dataset is one line that names the file and the place, in every format.
+"""A fault in a dataset is one line that names the file and the place, in every format.
 
 A fault is written into a golden dataset. Most are found when the dataset is read; a picture that is
 damaged behind its header is found when its pixels are.

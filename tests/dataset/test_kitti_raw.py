@@ -19,7 +19,7 @@ CAM0_FROM_VELO = np.array(
     [[0.0, -1, 0, -0.004], [0, 0, -1, -0.076], [1, 0, 0, -0.27], [0, 0, 0, 1]]
 )
 SHIFT_M = (0.06, -0.0004, 0.0027)
-"""Of camera 2 against camera 0."""
+"""Offset of camera 2 from camera 0."""
 Fault = Callable[[Path], None]
 
 

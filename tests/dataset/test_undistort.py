@@ -74,7 +74,7 @@ def test_the_view_is_the_widest_without_blank_pixels(lens):
 
 
 def outermost(pinhole: Intrinsics, lens: Lens) -> float:
-    """How far, in pixels, the outermost pixel centres reach beyond the source's."""
+    """Return the pixels by which the outermost pixel centres reach beyond the source's."""
     u, v = np.meshgrid(np.arange(K.width_px) + 0.5, np.arange(K.height_px) + 0.5)
     edge = np.ones(u.shape, bool)
     edge[1:-1, 1:-1] = False

@@ -1,4 +1,4 @@
-"""What is written as transforms.json is read back the same."""
+"""A dataset written as transforms.json is read back the same."""
 
 import math
 from pathlib import Path

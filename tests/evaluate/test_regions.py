@@ -1,4 +1,4 @@
-"""What a macroblock shows, for a wall whose geometry is plain; and where the bits go."""
+"""Regions of a wall with plain geometry: the content of macroblocks, and their bits."""
 
 from dataclasses import replace
 

@@ -108,7 +108,7 @@ def options_of(rival):
     }
 
 
-# Of every H.264 and H.265 rival, what decides how strong it is. Taken from the encoders' own SEI
+# Settings that decide how strong each H.264 and H.265 rival is. Taken from the encoders' own SEI
 # messages (x264 core 165, x265 4.2), presets as documented by `x264 --fullhelp`.
 X264 = {
     "cabac": "1",

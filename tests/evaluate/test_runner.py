@@ -1,4 +1,4 @@
-"""What an experiment keeps between runs, and what it writes and prints at the end."""
+"""An experiment keeps finished pieces between runs, and writes and prints its rows at the end."""
 
 import io
 import json

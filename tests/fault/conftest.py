@@ -50,7 +50,7 @@ ROOT = Path(__file__).parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
 RATE_HZ = 20
 SHIPPED_HZ = 5.0
-"""Of a vehicle that renders and codes 640x360 here, beside servers."""
+"""Rate of a vehicle that renders and codes 640x360 here, beside servers."""
 CALM_S = 3.0
 FAULT_S = 3.0
 """As long as the calm that it is compared with: a p99 of fewer pictures is the latest one."""
@@ -62,7 +62,7 @@ ALLOWANCE_MS = 10.0
 wake-up of a shared machine shall not count as harm done by a neighbour."""
 
 FEWER = 0.05
-"""Of 3 s at 20 Hz, three."""
+"""Share of frames that may be missing: three in 3 s at 20 Hz."""
 
 BOARD = Scoreboard("faults", "make test-fault")
 

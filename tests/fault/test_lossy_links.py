@@ -56,7 +56,7 @@ def lossy_wire(near: str, far: str, subnet: str, *numbers: float) -> Iterator[No
 
 @dataclass(frozen=True)
 class Shown:
-    """What came of the pictures that were captured in ``length_s``."""
+    """The fates of the pictures that were captured in ``length_s``."""
 
     lines: Sequence[dict[str, Any]]
     length_s: float

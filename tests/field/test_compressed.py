@@ -105,7 +105,7 @@ def test_the_decoded_bytes_are_pinned():
 
 
 def golden_field(gaussians: Gaussians) -> bytes:
-    """What the golden files were made of: ``make_gaussians(300, 1)``."""
+    """Return the field of the golden files: ``make_gaussians(300, 1)``."""
     return encode_field(field_of(gaussians, 0.5, 0.25).compressed())
 
 
@@ -325,7 +325,7 @@ def test_a_field_beyond_the_memory_it_may_take_is_refused_before_it_is_decoded()
 
 
 def ends_of(data: bytes) -> dict[float, int]:
-    """What each level of detail needs of an archive."""
+    """Return the bytes of an archive that each level of detail needs."""
     return dict(detail_ends(array_ends(data[: header_end(data[:PREFIX_BYTES])])))
 
 

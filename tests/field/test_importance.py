@@ -1,4 +1,4 @@
-"""What a splat contributes is its share of the picture; the order of importance follows it."""
+"""A splat contributes its share of the picture; the order of importance follows it."""
 
 import numpy as np
 import pytest
@@ -74,7 +74,7 @@ STEPS = Steps()
 
 
 def seen_error(error: np.ndarray, seen: np.ndarray) -> float:
-    """What errors [N, K, 3] of colours show, by the definition."""
+    """Return the visible error of colour errors [N, K, 3], by the definition."""
     return float(np.einsum("nkc,nkl,nlc->", error, seen, error))
 
 

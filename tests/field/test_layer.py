@@ -45,7 +45,7 @@ def test_a_layer_of_zeros_changes_nothing():
 
 
 def test_a_voxel_moves_the_splats_in_it_and_no_other():
-    """Of two splats 1 m apart only the first, one luma step of 2 / 255."""
+    """It moves the first of two splats 1 m apart, by one luma step of 2 / 255."""
     arrays = {
         "means": [[0.1, 0.1, 0.1], [1.1, 0.1, 0.1]], "quaternions": [[1, 0, 0, 0]] * 2,
         "log_scales": [[0, 0, 0]] * 2, "opacity_logits": [0, 0], "sh": [[[0.5, 0.5, 0.5]]] * 2,

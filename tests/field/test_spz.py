@@ -1,4 +1,4 @@
-"""What ``.spz`` keeps of splats; the writer against a decoder written from the format's text.
+"""``.spz`` keeps splats: the writer against a decoder written from the format's text.
 
 The reader is held against the writer."""
 

@@ -1,4 +1,4 @@
-"""What fuzzing started from and what it found: every reader takes each, or refuses it in words."""
+"""Seeds and finds of fuzzing: every reader takes each, or refuses it in words."""
 
 import subprocess
 import sys

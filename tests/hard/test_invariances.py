@@ -1,4 +1,4 @@
-"""What no change of coordinates, order or unit may change in a picture."""
+"""A picture does not depend on coordinates, order or units."""
 
 import math
 from dataclasses import replace

@@ -158,7 +158,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Street:
 
 @dataclass(frozen=True)
 class CodedStreet:
-    """What a vehicle would say on the drive."""
+    """Messages of a vehicle on the drive."""
 
     hello: Hello
     frames: list[Frame]
@@ -216,7 +216,7 @@ def serve(street: Street) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class DriveRecord:
-    """How the pictures of a drive ended: counted, and the lines of the frame log."""
+    """The fates of a drive's pictures: counted, and the lines of the frame log."""
 
     counts: Counter[str]
     lines: list[dict[str, Any]]

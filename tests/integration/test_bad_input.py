@@ -1,4 +1,4 @@
-"""What a careless or hostile peer sends: refused by name, and the next frame is right again."""
+"""Input of a careless or hostile peer is refused by name, and the next frame is right again."""
 
 import asyncio
 from dataclasses import replace

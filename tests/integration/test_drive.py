@@ -95,7 +95,7 @@ async def test_colours_stay_on_the_device_at_both_ends(
 async def test_a_device_removed_under_a_server_costs_no_frame(
     serve: Any, travel: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of six pictures the device draws two and fails in the third."""
+    """The device draws two of six pictures and fails in the third."""
     from rfcore.raster.opencl.device import DeviceLost
     from rfcore.raster.opencl.renderer import DeviceRasterizer
 

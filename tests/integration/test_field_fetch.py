@@ -129,7 +129,7 @@ def sent_up_to(monkeypatch: pytest.MonkeyPatch, size_bytes: int) -> Iterator[Eve
 
 
 def detail_bytes(archive: bytes) -> dict[float, int]:
-    """What each level of detail needs of an archive."""
+    """Return the bytes of an archive that each level of detail needs."""
     return dict(detail_ends(array_ends(archive[: header_end(archive[:PREFIX_BYTES])])))
 
 

@@ -1,4 +1,4 @@
-"""What one vehicle does wrong costs the others nothing or little; what fails is never silent."""
+"""A fault of one vehicle costs the others nothing or little, and is never silent."""
 
 import asyncio
 import threading
@@ -166,7 +166,7 @@ def submissions(server: Any, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a test of a failing background task needs."""
+    """Parts of a test of a failing background task."""
 
     coded: Any
     serve: Any
@@ -176,7 +176,7 @@ class Scene:
 
 
 class SurpriseError(Exception):
-    """What nobody expects."""
+    """An error that no code expects."""
 
 
 def surprise(*_: Any) -> Any:
@@ -200,7 +200,7 @@ REPEATED = {
     BackgroundTask.NATS_TWIN: ("twin.nats.TwinPublisher.run", ""),
     BackgroundTask.NATS_FIELDS: ("nats.FieldExchange.run", ""),
 }
-"""What each task that is repeated does, and the constant that says how often."""
+"""The work of each repeated task, and the constant of its period."""
 
 
 async def repeated_task_fails(task: BackgroundTask, scene: Scene) -> Any:

@@ -1,4 +1,4 @@
-"""Who asks for too much is told so, in status, metric and answer; the others notice nothing."""
+"""A peer that asks for too much is told in status, metric and answer; the others notice nothing."""
 
 import asyncio
 from collections.abc import Awaitable, Callable

@@ -21,7 +21,7 @@ from rfedge.loadtest.run import TestBed, run_loads, write_load_result
 from rfedge.loadtest.server import KeptRenders, passing, with_kept_renders
 
 PATIENT = Bounds(deadline_ms=60_000.0, on_time_percent=0.0, fairness=0.0, settling_mb=1e6)
-"""What is right is tested here; what is fast depends on who else uses this machine."""
+"""Bounds without speed: this machine may be busy with other work."""
 
 
 @pytest.fixture(scope="session")

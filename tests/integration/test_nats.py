@@ -49,7 +49,7 @@ def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 class Seen:
-    """What a reader of all servers is told."""
+    """Messages that a reader of all servers gets."""
 
     def __init__(self) -> None:
         self.messages: list[TwinMessage] = []

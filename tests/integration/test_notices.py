@@ -1,4 +1,4 @@
-"""What one vehicle sees, another is told: real agents, a real server, a socket."""
+"""A vehicle is told what another one sees: real agents, a real server, a socket."""
 
 import asyncio
 import json
@@ -85,7 +85,7 @@ async def heard_notice(vehicle: Any, notices: list[StreetNotice]) -> None:
 
 @pytest.fixture
 def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[LivePicture]:
-    """What the server has looked at so far."""
+    """Return the pictures that the server has looked at so far."""
     pictures: list[LivePicture] = []
     cut_out = rendering.cut_out
 

@@ -31,7 +31,7 @@ def rig(street: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[ReceivedPicture]:
-    """What the twin of any server shows."""
+    """Return the pictures that the twin of any server shows."""
     views: list[ReceivedPicture] = []
     show = Twin.show
 

@@ -1,4 +1,4 @@
-"""What ``rfedge size`` tells against a load that is measured at the link shaper."""
+"""``rfedge size`` agrees with a load that is measured at the link shaper."""
 
 import asyncio
 import math

@@ -1,4 +1,4 @@
-"""What a browser's user asks for beside pictures: objects, and views from a real server."""
+"""A browser's user gets objects and views, beside pictures, from a real server."""
 
 import asyncio
 import json

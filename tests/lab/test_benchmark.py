@@ -58,7 +58,7 @@ def quiet(_text: str) -> None:
 
 
 def test_v1_is_frozen():
-    """What ought to be different becomes v2 beside it: scores name this digest."""
+    """A change becomes v2 beside it: scores name this digest."""
     assert hashlib.sha256(V1.read_bytes()).hexdigest() == V1_SHA256
 
 

@@ -1,4 +1,4 @@
-"""What pose errors cost is measured against the same drive at its own poses."""
+"""The cost of pose errors is measured against the same drive at its own poses."""
 
 import json
 from dataclasses import replace

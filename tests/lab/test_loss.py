@@ -111,7 +111,7 @@ def crossing_of(drive, share, rtt_s=0.05, seed=1):
 
 
 def fates(crossing, sizes):
-    """What the link does to frames of these sizes, by the link alone; the first always arrives."""
+    """Return which frames of these sizes the link itself delivers; the first always arrives."""
     link = crossing.link()
     return [link.delivers(size) or index == 0 for index, size in enumerate(sizes)]
 

@@ -1,4 +1,4 @@
-"""What a load is told to take: laws of the plan, what is refused, and one small comparison."""
+"""Planned loads: laws of the plan, refused plans, and one small comparison."""
 
 from dataclasses import replace
 from pathlib import Path

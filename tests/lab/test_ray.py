@@ -1,4 +1,4 @@
-"""What a run on Ray told: its workers, its jobs' own times, and what was added to them."""
+"""Report of a run on Ray: its workers, the times of its jobs, and the overhead."""
 
 import hashlib
 import json

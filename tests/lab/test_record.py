@@ -1,4 +1,4 @@
-"""What records results asks for commands and options that there are."""
+"""The makefiles of recorded results use commands and options that exist."""
 
 import shlex
 import shutil

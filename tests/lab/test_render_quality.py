@@ -1,4 +1,4 @@
-"""What a render misses, where that is known by construction."""
+"""The missing parts of a render, where they are known by construction."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What ``rfedge-lab rig`` reads off the twin."""
+"""``rfedge-lab rig`` reads its figures off the twin."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What is read from vehicles' reports, and the cases once, with few small vehicles."""
+"""Reports of vehicles are read, and each case is run once with few small vehicles."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a soak calls growth."""
+"""A soak tells growth from noise."""
 
 from dataclasses import replace
 

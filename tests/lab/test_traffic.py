@@ -66,7 +66,7 @@ def test_a_packed_trace_is_the_same(tmp_path):
 
 
 def test_nobody_is_lost_on_the_way(tmp_path):
-    """Who is in a cell came there, began there, or was there: over every step and cell."""
+    """A vehicle in a cell came there, began there, or was there: over every step and cell."""
     random = np.random.default_rng(3)
     points_m = random.uniform((-150, -120), (550, 120), (40, 2))
     lines = ["<fcd-export>"]

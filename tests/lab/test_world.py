@@ -1,4 +1,4 @@
-"""What ``rfedge-lab world`` compares with the generator's truth, and how."""
+"""``rfedge-lab world`` compares objects and views with the generator's truth."""
 
 import json
 import math

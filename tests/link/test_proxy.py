@@ -218,7 +218,7 @@ def test_a_rate_beside_a_profile_is_refused(profile: Callable[..., Path]) -> Non
 
 
 async def test_two_paths_share_one_link() -> None:
-    """What goes to two servers goes through one radio: both count as one uplink."""
+    """Traffic to two servers shares one radio: both count as one uplink."""
     other = await asyncio.start_server(echo, "127.0.0.1", 0)
     port = other.sockets[0].getsockname()[1]
     async with linked(echo, also=(f"127.0.0.1:0=127.0.0.1:{port}",)) as proxy:

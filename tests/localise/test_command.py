@@ -1,4 +1,4 @@
-"""What ``rfedge localise`` measures and writes."""
+"""``rfedge localise`` measures poses and writes them."""
 
 import json
 import math

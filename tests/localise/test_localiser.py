@@ -32,7 +32,7 @@ from rfcore.views import FieldView, PosedPicture, View
 pytestmark = pytest.mark.sample
 SAMPLES = Path(__file__).parents[2] / "samples"
 FEW = LocaliserSettings(most_hypotheses=3)
-"""Of a search that is to end lost."""
+"""Settings of a search that is to end lost."""
 START = ((1.4, 0.2, 1.4), (0.0, math.radians(3.0), 0.0))
 """2 m and 3 degrees off."""
 U8 = NDArray[np.uint8]
@@ -123,7 +123,7 @@ def on_the_spot(taken: PosedPicture, by_m: Vec3) -> float:
 
 
 def test_near_things_tell_a_pose_from_one_decimetres_away_that_far_things_cannot():
-    """Of poses ahead and behind, where the middle of the picture hardly moves."""
+    """The poses lie ahead and behind, where the middle of the picture hardly moves."""
     limit = LocaliserSettings().least_on_the_spot
     for taken in (picture(9), picture(12, "vehicles")):
         assert on_the_spot(taken, (0.0, 0.0, 0.0)) > 1.4 * limit
@@ -136,7 +136,7 @@ CARRIED_OFF_M: tuple[Vec3, ...] = (
     *((x, 0.0, 0.0) for x in (-0.5, 0.5, 1.0)),
     *((x, 0.0, x) for x in (-0.7, 0.7)),
 )
-"""What is left when a pose was carried over half a second by a motion that is not known well."""
+"""Errors of a pose that was carried over half a second by an uncertain motion."""
 
 
 def carried(taken: PosedPicture, off_m: Vec3) -> Track | None:
@@ -152,7 +152,7 @@ def carried(taken: PosedPicture, off_m: Vec3) -> Track | None:
 
 @pytest.mark.parametrize(("number", "drive"), [(9, "empty"), (21, "vehicles")])
 def test_a_track_that_begins_metres_off_is_right_or_does_not_begin(number, drive):
-    """By alignment and agreement alone, half of what begins here would be up to 2 m wrong."""
+    """Alignment and agreement alone would leave half of these tracks up to 2 m wrong."""
     taken = picture(number, drive)
     tracks = [carried(taken, off_m) for off_m in CARRIED_OFF_M]
     truth = taken.camera.world_from_cam

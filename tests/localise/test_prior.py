@@ -24,7 +24,7 @@ POSE = Pose((3.0, -2.0, 1.5), (0.5, -0.5, 0.5, -0.5))
 
 
 def distances_m(prior: PosePrior, depth_m: float) -> list[float]:
-    """How far each hypothesis lies from the prior."""
+    """Return the distance of each hypothesis from the prior."""
     back = prior.world_from_cam.inverse()
     return [math.hypot(*back.compose(pose).translation_m) for pose in hypotheses(prior, depth_m)]
 

@@ -1,4 +1,4 @@
-"""How far a motion moves pixels, and how far a field of wrong depth lets a camera move."""
+"""Laws of tracking: a motion moves pixels, and wrong depth limits the camera's motion."""
 
 import math
 from dataclasses import replace

@@ -31,7 +31,7 @@ CAMERA = Camera(
 
 @dataclass(frozen=True)
 class Scene:
-    """What both machines draw and train."""
+    """The scene that both machines draw and train."""
 
     field: NgpParameters
     peaks: np.ndarray

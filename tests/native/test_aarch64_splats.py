@@ -25,7 +25,7 @@ RATES = LearningRates(means=1e-2)
 
 @dataclass(frozen=True)
 class Scene:
-    """What both machines draw and train."""
+    """The scene that both machines draw and train."""
 
     gaussians: Gaussians
     camera: Camera

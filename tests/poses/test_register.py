@@ -176,7 +176,7 @@ def test_sigterm_ends_it_in_one_line_and_leaves_nothing(drive, tmp_path):
 
 
 def test_an_exception_of_the_waiting_thread_cancels_colmaps_work():
-    """What a signal handler raises, without a signal."""
+    """It is the exception of a signal handler, without a signal."""
     tokens = []
 
     def work(*, cancellation_token: pycolmap.CancellationToken) -> None:

@@ -16,7 +16,7 @@ from rfedge.samples import sample_path
 from rfedge.video import write_mp4
 
 SHARP = (1, 5, 7, 9)
-"""Of twelve frames at 6 Hz, one in each half second."""
+"""Sharp ones of twelve frames at 6 Hz, one in each half second."""
 
 
 def picture(number: int, *, sharp: bool) -> np.ndarray:

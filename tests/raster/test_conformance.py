@@ -32,7 +32,7 @@ MAX_FLIPPED = 0.005
 
 @dataclass(frozen=True)
 class Implementation:
-    """How to draw a set of Gaussians, and how to take the gradient of a weighted sum of colours."""
+    """Draws a set of Gaussians, and takes the gradient of a weighted sum of colours."""
 
     draw: Callable[[Gaussians, Camera, bool], View]
     gradients: Callable[[Gaussians, Camera, np.ndarray, bool], dict[str, np.ndarray]]

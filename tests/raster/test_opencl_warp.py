@@ -200,8 +200,8 @@ def test_references_of_a_drive_are_those_of_the_cpu(isa, size_px):
 
 @slow
 def test_only_pictures_cross_between_device_and_cpu(traffic):
-    """Of a frame 1.5 bytes a pixel for each picture: down its render and the references that are
-    made of it, up the earlier frame. The rest are counts, camera and poses."""
+    """Each picture has 1.5 bytes a pixel. The render and the references made of it go down, the
+    earlier frame goes up. The rest are counts, camera and poses."""
     field, cameras = SplatField(scene(800), isa=OPENCL), drive(camera(160, 90))
     picture, rest = 160 * 90 * 3 // 2, 1000
     references(field, cameras[:1])

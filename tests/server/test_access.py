@@ -1,4 +1,4 @@
-"""What an access file grants and takes away, as a table; and files that make no sense."""
+"""An access file grants and takes away, as a table; files that make no sense are refused."""
 
 import os
 from datetime import UTC, datetime

@@ -90,7 +90,7 @@ def test_a_camera_is_free_when_the_last_stream_of_its_agent_ended(hello: Hello) 
 def test_one_camera_that_is_taken_refuses_the_whole_hello_and_displaces_nobody(
     hello: Hello,
 ) -> None:
-    """Of the Hello, "front" may be taken over, "rear" not."""
+    """ "front" of the Hello may be taken over, "rear" may not."""
     cameras = ActiveCameras()
     front, rear = hello.cameras
     silent, alive = Sender("a"), Sender("c", CAMERA_SILENT_S)

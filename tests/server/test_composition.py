@@ -193,7 +193,7 @@ def test_the_pictures_that_see_most_of_a_view_are_taken() -> None:
 def test_where_the_field_is_darker_a_smaller_difference_is_a_change(
     levels: float, changes: bool
 ) -> None:
-    """Of 20 levels, in a twentieth of the picture."""
+    """The difference is 20 levels, in a twentieth of the picture."""
     noise = np.random.default_rng(5).uniform(-20, 20, (64, 96, 3))
     colour = ((levels + noise) / 255).astype(np.float32)
     flat = np.ones((64, 96), np.float32)

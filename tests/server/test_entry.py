@@ -1,4 +1,4 @@
-"""What one stream is charged for, and what it gives back, on a clock the test turns."""
+"""One stream is charged, and gives back, on a clock the test turns."""
 
 from collections.abc import Callable
 from dataclasses import replace

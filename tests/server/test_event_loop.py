@@ -34,7 +34,7 @@ def unexpected(error: Exception) -> None:
 
 OWNERS = ("cav-1", "cav-2", "cav-3")
 steps = st.lists(st.sampled_from([*OWNERS, "take"]), max_size=60)
-"""What happens to a queue: an owner puts an item, or the next one is taken."""
+"""Steps of a queue: an owner puts an item, or the next one is taken."""
 
 
 @given(steps)

@@ -72,7 +72,7 @@ def test_one_view_through_fog_moves_it_little() -> None:
 
 
 def test_what_floats_above_half_of_it_does_not_raise_it() -> None:
-    """By up to a fifth of the depth, which is 0.3 m; the median lies 0.03 m above the ground."""
+    """They float up to a fifth of the depth, 0.3 m; the median lies 0.03 m above the ground."""
     rng = np.random.default_rng(4)
 
     def floating(camera: Camera) -> View:

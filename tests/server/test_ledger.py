@@ -1,4 +1,4 @@
-"""What identities hold and spend, on a clock the test turns."""
+"""Identities hold and spend budgets, on a clock the test turns."""
 
 import math
 from collections.abc import Callable

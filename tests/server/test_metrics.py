@@ -168,7 +168,7 @@ def _predicted(frame: Frame, references: tuple[Reference, ...]) -> object:
 
 
 COUNTED_AGAIN = {"error.limit", "end.error.limit"}
-"""What is counted is the limit of an error that was raised elsewhere."""
+"""Metrics that count the limit of an error that was raised elsewhere."""
 
 
 def test_every_limit_the_server_raises_is_one_of_the_enumeration() -> None:

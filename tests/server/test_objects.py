@@ -117,7 +117,7 @@ def test_what_is_dark_as_a_shadow_all_over_stands_where_it_does() -> None:
 
 
 def test_a_shadow_that_is_long_moves_nothing() -> None:
-    """What lies further than ``SHADOW_M`` before a thing may be another one."""
+    """A difference further than ``SHADOW_M`` before a thing may be another thing."""
     shaded = joined(STREET, shadow(0.8, 7.0, 12.0)).gaussians
     (found,) = seen(joined(shaded, car(0.8, 12.0)), camera_at())
     assert math.dist(found.at_m, (0.8, 7.0, -CAMERA_M)) < 0.8

@@ -1,4 +1,4 @@
-"""Who is let in at which rate, on a clock the test turns."""
+"""Vehicles are let in at some rate or refused, on a clock the test turns."""
 
 import math
 from dataclasses import replace

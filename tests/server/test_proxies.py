@@ -1,4 +1,4 @@
-"""Whom a proxy's header names, and which headers are refused."""
+"""A proxy's header names a vehicle, or is refused."""
 
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
@@ -25,7 +25,7 @@ HEADER = f"By=spiffe://rfedge/server/edge;Hash=ab12;{CERT};{URI}"
 
 
 class Call:
-    """What is asked of gRPC's context of a call."""
+    """The part of gRPC's context of a call that is used."""
 
     def __init__(self, peer: str | None, headers: Iterable[str]) -> None:
         self._auth: Mapping[str, Iterable[bytes]] = {}

@@ -1,4 +1,4 @@
-"""What is drawn in advance, so that the first pictures of a server are not late."""
+"""Renders are drawn in advance, so that the first pictures of a server are not late."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -60,7 +60,7 @@ SPECIAL = {
 }
 SKY_TIMES_S = (0.0, 1.2, 1.4, 2.8, 4.2)
 ON = {"turnover": {"day": 3}}
-"""What else must be set for a key to change anything."""
+"""Other keys that must be set for a key to change anything."""
 
 
 def changed(settings: Any, key: str) -> Any:
@@ -114,7 +114,7 @@ def low_skies(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def blocks_for_buildings(layout: Layout, _rng: np.random.Generator) -> StreetPart:
-    """What is as high as a house: painting its walls takes seconds."""
+    """Return blocks as high as houses: painting walls takes seconds."""
     blocks = [
         boxes(Surface("block", Label.BUILDING), (p.start_m, p.y_m, 0), (p.end_m, p.y_m, p.height_m))
         for p in layout.plots
@@ -123,7 +123,7 @@ def blocks_for_buildings(layout: Layout, _rng: np.random.Generator) -> StreetPar
 
 
 def posts_for_trees(layout: Layout, _rng: np.random.Generator) -> StreetPart:
-    """What stands where a tree would: growing them takes seconds."""
+    """Return posts in place of trees: growing trees takes seconds."""
     posts = [
         boxes(Surface("stem", Label.POLE), (t.x_m, t.y_m, 0), (t.x_m, t.y_m, 1))
         for t in layout.trees

@@ -21,7 +21,7 @@ def edges(mesh: Mesh) -> Counter[tuple[tuple[float, ...], tuple[float, ...]]]:
 
 
 def volume_m3(mesh: Mesh) -> float:
-    """By the divergence theorem; positive where faces turn anticlockwise seen from outside."""
+    """Return the volume by the divergence theorem; positive where faces turn anticlockwise."""
     a, b, c = mesh.vertices[mesh.faces].astype(float).transpose(1, 0, 2)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 

@@ -295,7 +295,7 @@ def test_in_a_wider_street_nothing_of_the_effects_is_where_it_would_be_in_a_narr
 
 
 def test_people_change_nothing_else_in_the_street(street):
-    """What was there stays the same object, and vehicles are those of the same street without."""
+    """Other objects stay the same, and vehicles are those of the street without people."""
     for effect in (Pedestrians(), Cyclists()):
         with_people = effect.change(street, rng())
         assert with_people.meshes is street.meshes or with_people.meshes == street.meshes

@@ -164,7 +164,7 @@ def test_a_plates_text_is_on_its_texture_and_readable():
 
 
 def test_letters_run_from_left_to_right_seen_from_outside():
-    """Who looks at the nose has the car's right side, -y, on the left."""
+    """Seen from the front, the car's right side, -y, is on the left."""
     plates = next(m for m in vehicle(looking_like("suv")) if m.material == "number plate")
     front = plates.vertices[:, 0] > 0
     for chosen, left in ((front, -1.0), (~front, 1.0)):

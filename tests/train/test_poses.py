@@ -53,7 +53,7 @@ def picture(field: SplatField, camera: Camera, name: str = "0.png") -> PosedPict
 
 
 def test_the_gradient_is_that_of_differences():
-    """Of a weighted sum of the picture, of splats so large that few edges pass through pixels."""
+    """It is that of a weighted sum; splats are so large that few edges pass through pixels."""
     scene = splats(40, -0.6)
     rasterizer = TrainableRasterizer(scene)
     rng = np.random.default_rng(5)

@@ -113,7 +113,7 @@ def cloudy(towards: np.ndarray) -> np.ndarray:
 
 
 def before_clouds(camera: Camera, wall_m: float = 3.0) -> Target:
-    """What a camera sees of the sky over a textured wall, whose top is at its own height."""
+    """Return pictures of the sky over a textured wall, whose top is at the camera's height."""
     rays, x_m = ray_directions(camera), camera.world_from_cam.translation_m[0]
     across = (x_m + wall_m * rays[..., 0] / rays[..., 2]) / 0.05
     down = wall_m * rays[..., 1] / rays[..., 2] / 0.05
@@ -151,7 +151,7 @@ def test_a_wall_that_fills_all_pictures_is_no_sky(cameras):
 
 @pytest.mark.parametrize("directions", [1, 3, 4096, 9000])
 def test_directions_are_spread_evenly(directions):
-    """Of a smooth white everything all directions in view are kept: their share of the sphere."""
+    """All directions in view of a white world are kept: their share of the sphere."""
     at = [Camera(K, Pose((x, 0.0, 0.0), (1.0, 0, 0, 0))) for x in (0.0, 5.0)]
     sky = sky_gaussians([Target(camera, paint(255)) for camera in at], directions, 0.6)
     corner = np.arcsin(20 * 12 / np.sqrt((30**2 + 20**2) * (30**2 + 12**2)))

@@ -174,7 +174,7 @@ def test_the_sky_of_still_pictures_is_found_and_written(still, tmp_path):
 
 
 def test_a_start_larger_than_the_limit_is_refused(still, tmp_path):
-    """Of the sky too, which comes beside the points and is found in the pictures."""
+    """The start includes the sky, which comes beside the points and is found in the pictures."""
     too_few = r"density\.limit: 310 Gaussians are fewer than the \d+ to start with, \d+ of them sky"
     with pytest.raises(InvalidInput, match=too_few):
         verb(still, tmp_path / "a.rff", iterations=1, gaussians=300, limit=310, sky=2000).run()

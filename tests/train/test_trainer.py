@@ -1,4 +1,4 @@
-"""What trainers of every kind share: counting, divergence, metadata, settings of the digest."""
+"""Trainers of every kind share counting, divergence, metadata and settings of the digest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -65,7 +65,7 @@ Event = tuple[VehicleLocation, TwinMessage]
 
 @st.composite
 def interleaved(draw: st.DrawFn) -> list[Event]:
-    """What two or three servers publish of one vehicle, each in its own order."""
+    """Interleave what two or three servers publish of one vehicle, each in its own order."""
     waiting = []
     for number in range(draw(st.integers(2, 3))):
         at = place(f"server{number}", number)

@@ -1,4 +1,4 @@
-"""What the page is told of fields, cameras and tiles, and how readers of the board hear of it."""
+"""The page is told of fields, cameras and tiles, as are readers of the board."""
 
 import json
 import struct

@@ -1,4 +1,4 @@
-"""Who may open the page, what a browser is sent, and that a slow one delays nobody."""
+"""The page opens for those who may see it, and a slow browser delays nobody."""
 
 from __future__ import annotations
 

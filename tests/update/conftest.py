@@ -158,7 +158,7 @@ def at_dusk(street: Street, dusk: SplatField, make_pass: MakePass) -> Street:
 
 @pytest.fixture(scope="session")
 def update(noon: SplatField, dusk: SplatField, make_pass: MakePass) -> Update:
-    """What the passes of ``at_dusk`` teach; learnt once."""
+    """The update that the passes of ``at_dusk`` teach; learnt once."""
     settings = UpdateSettings(LearnAs.COLOURS, frames=16)
     made = learn(noon, [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)], settings)
     assert not made.refused

@@ -1,4 +1,4 @@
-"""What is learnt of another light and of change, and what is not written."""
+"""Another light and changes are learnt; an update that does not pay is not written."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What the learning process publishes, what it does not, and what it takes back."""
+"""The learning process publishes updates, withholds some, and takes some back."""
 
 import errno
 import os
@@ -286,7 +286,7 @@ def test_recordings_above_the_age_teach_nothing(at_dusk, max_age_s, lights):
 
 
 def test_what_was_learnt_is_shown(street):
-    """Of the tile's lights, and of the last update, which was withdrawn at last."""
+    """The tile's lights are shown, and the last update, which was withdrawn at last."""
     registry = CollectorRegistry()
     metrics = ServerMetrics(registry)
 

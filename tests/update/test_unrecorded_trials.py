@@ -1,4 +1,4 @@
-"""What a vehicle that is not recorded is shown to suffer, and what of it is kept."""
+"""A trial on a vehicle that is not recorded shows its losses, and keeps no picture."""
 
 import asyncio
 from collections.abc import AsyncIterator

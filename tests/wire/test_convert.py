@@ -1,4 +1,4 @@
-"""What goes over the wire comes back equal; what cannot be is refused by name."""
+"""Messages come back equal from the wire; impossible ones are refused by name."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What consumers and servers say to each other survives the wire, and what is wrong is named."""
+"""Messages of consumers and servers survive the wire, and faults in them are named."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is waited for is said soon, and then ever more rarely."""
+"""A reason to wait is printed soon, and then ever more rarely."""
 
 import threading
 

@@ -190,7 +190,7 @@ class CodecConfig:
 
     @property
     def vertical_range(self) -> int:
-        """How far vectors may reach up or down, in samples (MaxVmvR of table A-1)."""
+        """Return the vertical range of motion vectors, in samples (MaxVmvR of table A-1)."""
         level = self.level_idc
         return 64 if level <= 10 else 128 if level <= 20 else 256 if level <= 30 else 512
 

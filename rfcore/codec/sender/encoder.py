@@ -62,7 +62,7 @@ from rfcore.views import FieldView
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """How one frame is to be coded. Raises ``InvalidInput`` for choices that contradict each other
+    """The coding of one frame. Raises ``InvalidInput`` for choices that contradict each other
     or are out of range."""
 
     references: References | None = None

@@ -179,9 +179,10 @@ def _coded_bits(satd: Array, ssd: Array, crf: float) -> float:
 
 @dataclass(frozen=True)
 class RateModel:
-    """What coded frames have taught: ``octaves``, log2 of coded over estimated bits, by references.
+    """Model of the rate, learnt from coded frames.
 
-    ``crf`` is that of the last frame, which limits how fast quality rises; None before the first.
+    ``octaves``: log2 of coded over estimated bits, by references. ``crf`` is that of the
+    last frame, which limits how fast quality rises; None before the first.
     """
 
     octaves: Mapping[References, float] = field(default_factory=dict)

@@ -28,7 +28,7 @@ BOX = Bounds((-200.0, -200.0, -20.0), (200.0, 200.0, 50.0))
 
 
 class Told:
-    """What a feed told: every problem, and those that begin."""
+    """Problems that a feed reported: every one, and those that begin."""
 
     def __init__(self) -> None:
         self.all: list[FeedProblem] = []

@@ -1,4 +1,4 @@
-"""What a hard case is: what must come out, and what came out.
+"""A hard case: the expected result, and the result.
 
 ``tests/hard/test_stability.py`` runs every case; the run that checks them also writes the page
 (``make stability``), so that the two cannot differ.
@@ -14,7 +14,7 @@ from rfcore.errors import RfedgeError
 
 @dataclass(frozen=True)
 class Finding:
-    """What one case came to.
+    """The result of one case.
 
     ``error`` is the largest difference from what is right and ``limit`` what it may be; both are
     None where the answer is yes or no.

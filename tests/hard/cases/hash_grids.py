@@ -46,7 +46,7 @@ MIN_TRANSMITTANCE = 1e-4
 
 @dataclass(frozen=True)
 class Make:
-    """What a field is made of; ``log_density`` None makes a random one."""
+    """The parameters of a field; ``log_density`` None makes a random one."""
 
     log_density: float | None = None
     unbounded: bool = False

@@ -40,7 +40,7 @@ def _identical(shape: Shape) -> Finding:
 
 
 def _flat_pair(a: int, b: int, shape: Shape) -> Finding:
-    """Of constants only the luminance term of SSIM is left."""
+    """For constants only the luminance term of SSIM is left."""
     ratio_db, likeness = (
         psnr(_flat(shape, a), _flat(shape, b)),
         ssim(_flat(shape, a), _flat(shape, b)),

@@ -35,7 +35,7 @@ Values = Mapping[str, object]
 
 @dataclass(frozen=True)
 class Gradients:
-    """Of all parameters, the native ones and the float64 ones, by name."""
+    """The native and the float64 gradients of all parameters, by name."""
 
     native: Mapping[str, F32]
     float64: Mapping[str, F64]
