@@ -1,12 +1,12 @@
 """Options of a service from a TOML file, with the command line's in front of them."""
 
 import pytest
-import tyro
 
 from cav_agent.config import AgentConfig
 from mec_server.config import ServerConfig
 from rfcore.errors import InvalidInput
-from rfcore.wire.settings import OPTIONS, words_of_command_line
+from rfcore.program import parse_options
+from rfcore.wire.settings import words_of_command_line
 
 
 @pytest.fixture
@@ -15,7 +15,7 @@ def parsed(tmp_path):
         file = tmp_path / "service.toml"
         file.write_text(text)
         given = words_of_command_line([*words, "--config", str(file)])
-        return tyro.cli(made, config=OPTIONS, args=given)
+        return parse_options(made, "service", given)
 
     return parse
 
