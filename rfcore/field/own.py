@@ -32,7 +32,7 @@ _TRIED = Intrinsics(32, 18, 24.0, 24.0, 16.0, 9.0)
 
 
 class OwnRenderer(Protocol):
-    """What a class needs to be a field.
+    """Members that a class needs to be a field.
 
     It may also have ``exact`` (bool; false without it), ``bounds`` (``Bounds``; the origin alone
     without it), ``metadata`` (``FieldMetadata``: the name, and the origin of the axes) and

@@ -92,12 +92,13 @@ def test_every_verb_has_help_that_says_once_what_it_does():
         (streetgen.cli.Verb, "streetgen build"),
     ],
 )
-def test_every_program_wraps_its_help_by_the_width_alone(kind, name, monkeypatch, capsys):
+def test_every_program_wraps_its_help_by_the_width_alone(kind, name, monkeypatch):
     """No line of an option's text has room for the first word of the next."""
     monkeypatch.setenv("COLUMNS", "100")
-    with pytest.raises(SystemExit):
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
         parse_options(kind, name, [*name.split()[1:], "--help"])
-    page = capsys.readouterr().out
+    page = out.getvalue()
     boxed = [line[2:-2] for line in page.splitlines() if line.startswith("│")]
     indents = [len(line) - len(line.lstrip()) for line in boxed]
     room = [len(line) - len(line.rstrip()) for line in boxed]

@@ -28,7 +28,7 @@ def test_a_file_stands_for_the_options_and_the_command_line_wins(parsed, tmp_pat
     assert config.neighbours == ("b:2", "c:3")
     assert (config.metrics.port, config.allow_recording) == (9000, False)
     server = parsed(ServerConfig, f'fields = "{tmp_path}"\nno-notices = true\n')
-    assert server.notices is False
+    assert server.no_notices
 
 
 @pytest.mark.parametrize(
