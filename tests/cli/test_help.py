@@ -99,12 +99,12 @@ def test_every_program_wraps_its_help_by_the_width_alone(kind, name, monkeypatch
     with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
         parse_options(kind, name, [*name.split()[1:], "--help"])
     page = out.getvalue()
-    boxed = [line[2:-2] for line in page.splitlines() if line.startswith("│")]
-    indents = [len(line) - len(line.lstrip()) for line in boxed]
-    room = [len(line) - len(line.rstrip()) for line in boxed]
-    wrapped = [k for k in range(1, len(boxed)) if indents[k] == indents[k - 1] > 5]
+    lines = [line[2:-2] for line in page.splitlines() if line.startswith("  ")]
+    indents = [len(line) - len(line.lstrip()) for line in lines]
+    room = [len(line) - len(line.rstrip()) for line in lines]
+    wrapped = [k for k in range(1, len(lines)) if indents[k] == indents[k - 1] > 5]
     assert len(wrapped) > 3
-    assert all(len(boxed[k].split()[0]) >= room[k - 1] for k in wrapped), page
+    assert all(len(lines[k].split()[0]) >= room[k - 1] for k in wrapped), page
     assert "(default: True)" not in page
 
 
