@@ -144,16 +144,6 @@ def _is_healthy(host: Mapping[str, Any]) -> bool:
     return told == {"eds_health_status": "HEALTHY"}
 
 
-def check_config(setup: EnvoySetup) -> None:
-    """Have Envoy read the configuration; raise ``RfedgeError`` with what it says of it."""
-    done = subprocess.run(
-        [str(setup.binary), "--mode", "validate", "--config-path", str(setup.write())],
-        cwd=setup.folder, capture_output=True, text=True, timeout=START_S, check=False,
-    )  # fmt: skip
-    if done.returncode != 0:
-        raise RfedgeError(f"Envoy refuses {setup.config}: {done.stderr.strip()}")
-
-
 @contextmanager
 def run_envoy(setup: EnvoySetup, addresses: Sequence[str]) -> Iterator[Envoy]:
     """Run Envoy before servers until the block ends; all of them are healthy when it begins.

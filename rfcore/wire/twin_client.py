@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable, Generator, Iterable
 from types import TracebackType
+from typing import Any
 
 import grpc
 
@@ -78,7 +79,7 @@ class TwinClient:
     ) -> None:
         self.address = _checked(address, tls, allow_insecure)
         self._tls = tls
-        self._channel = _channel(self.address, tls)
+        self._channel: grpc.Channel = _channel(self.address, tls, grpc)
         self._lock = threading.Lock()
         self._stopped = False
         self._call: grpc.Call | None = None
@@ -195,12 +196,7 @@ class AsyncTwinClient:
         self._channel: grpc.aio.Channel | None = None
 
     async def __aenter__(self) -> AsyncTwinClient:
-        options, address = CONSUMER_OPTIONS, str(self.address)
-        if self._tls is None:
-            self._channel = grpc.aio.insecure_channel(address, options=options)
-        else:
-            credentials = self._tls.channel_credentials()
-            self._channel = grpc.aio.secure_channel(address, credentials, options=options)
+        self._channel = _channel(self.address, self._tls, grpc.aio)
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -267,7 +263,8 @@ def _checked(address: str, tls: TlsFiles | None, allow_insecure: bool) -> Addres
     return parsed
 
 
-def _channel(address: Address, tls: TlsFiles | None) -> grpc.Channel:
+def _channel(address: Address, tls: TlsFiles | None, api: Any) -> Any:
+    """Return a channel of ``api``: ``grpc`` for threads, or ``grpc.aio``."""
     if tls is None:
-        return grpc.insecure_channel(str(address), options=CONSUMER_OPTIONS)
-    return grpc.secure_channel(str(address), tls.channel_credentials(), options=CONSUMER_OPTIONS)
+        return api.insecure_channel(str(address), options=CONSUMER_OPTIONS)
+    return api.secure_channel(str(address), tls.channel_credentials(), options=CONSUMER_OPTIONS)

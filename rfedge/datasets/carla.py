@@ -42,11 +42,6 @@ def pose_from_carla(world_from_sensor: Sequence[Sequence[float]]) -> Pose:
     return Pose.from_matrix(rows)
 
 
-def point_from_carla(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return a point of CARLA's world in ours."""
-    return (x, -y, z)
-
-
 def intrinsics_of_fov(width_px: int, height_px: int, fov_deg: float) -> Intrinsics:
     """Return the intrinsics of ``sensor.camera.rgb``: horizontal field of view, square pixels."""
     if not 0 < fov_deg < 180:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfedge.datasets.carla import intrinsics_of_fov, point_from_carla, pose_from_carla
+from rfedge.datasets.carla import intrinsics_of_fov, pose_from_carla
 
 K = intrinsics_of_fov(1920, 1080, 90.0)
 
@@ -27,6 +27,11 @@ def transform(
     return carla.Transform(carla.Location(*at), carla.Rotation(pitch=pitch, yaw=yaw, roll=roll))
 
 
+def ours_of_carla(x, y, z):
+    """Return a point of CARLA's left-handed world in ours."""
+    return (x, -y, z)
+
+
 @given(at=place, angles=st.tuples(degrees, degrees, degrees), seen=ahead)
 def test_a_point_before_the_sensor_lands_on_carlas_pixel(at, angles, seen):
     """CARLA's own recipe: in the sensor, (y, -z, x) are right, down, forward.
@@ -37,7 +42,7 @@ def test_a_point_before_the_sensor_lands_on_carlas_pixel(at, angles, seen):
     sensor = transform(at, angles)
     world = sensor.transform(carla.Location(*seen))
     camera = Camera(K, pose_from_carla(sensor.get_matrix()))
-    u_px, v_px, depth_m = camera.project(point_from_carla(world.x, world.y, world.z))
+    u_px, v_px, depth_m = camera.project(ours_of_carla(world.x, world.y, world.z))
     x, y, z = seen
     assert depth_m == pytest.approx(x, abs=2e-4)
     assert u_px == pytest.approx(K.cx_px + K.fx_px * y / x, abs=0.1)
@@ -54,9 +59,9 @@ def test_the_axes_are_the_librarys_vectors(at, angles):
         (right, sensor.get_right_vector(), 1),
         (down, sensor.get_up_vector(), -1),
     ):
-        expected = [sign * v for v in point_from_carla(theirs.x, theirs.y, theirs.z)]
+        expected = [sign * v for v in ours_of_carla(theirs.x, theirs.y, theirs.z)]
         assert ours == pytest.approx(expected, abs=1e-5)
-    assert pose.translation_m == pytest.approx(point_from_carla(*at), abs=1e-4)
+    assert pose.translation_m == pytest.approx(ours_of_carla(*at), abs=1e-4)
 
 
 def test_yaw_turns_to_the_right():

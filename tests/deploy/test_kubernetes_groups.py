@@ -11,7 +11,8 @@ import pytest
 import yaml
 
 from deploy.test_kubernetes import VERSIONS, documents
-from lab.servers.envoy import EnvoySetup, check_config, envoy_binary
+from envoy_config import check_config
+from lab.servers.envoy import EnvoySetup, envoy_binary
 from rfcore.wire.conventions import TILE
 from rfedge.certs import Members, certify, write_certificates
 

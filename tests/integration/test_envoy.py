@@ -19,6 +19,7 @@ from grpc_health.v1 import health_pb2
 from rich.console import Console
 
 from cav_agent.config import AgentLimits, PaceKind
+from envoy_config import check_config
 from lab.servers import EvalScale
 from lab.servers.cases import ScaleRow
 from lab.servers.envoy import (
@@ -26,7 +27,6 @@ from lab.servers.envoy import (
     Envoy,
     EnvoySetup,
     ServerGroup,
-    check_config,
     envoy_binary,
     run_envoy,
 )
