@@ -5,6 +5,7 @@ Everything is taken from a ``CellStore`` if it is there already.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import monotonic
@@ -21,6 +22,8 @@ from rfedge.jobs import CellKey, CellStore, Rows
 
 HEADLINE_DB: Window = (32.0, 35.0)
 """Window of luma PSNR that BD-rates are quoted over unless another is asked for."""
+LOSSLESS_DB = 99.0
+"""Quality at which a frame without any error counts."""
 PROBE_FRAMES = 2
 TIMED_FRAMES, TIMED_REPEATS, ROUNDS = 12, 3, 5
 
@@ -131,7 +134,7 @@ def spanning_points(
     Codes the clip at the ends alone, so that a window that cannot be spanned is found before the
     rest is coded. Added points are as far apart as the last two, up to the coder's ``limits``.
     Every frame should span the window, so that any resampled clip does; the clip must: raises
-    ``InvalidInput`` with the quality reached otherwise.
+    ``WindowNotReached`` with the quality reached otherwise.
     """
     low_db, high_db = window_db
     points = list(coder.points)
@@ -149,15 +152,33 @@ def spanning_points(
         if worse is None:
             break
         points.append(worse)
-    best_db, worst_db = coded(points[0]).psnr_db(), coded(points[-1]).psnr_db()
-    if not worst_db <= low_db <= high_db <= best_db:
-        raise InvalidInput(
-            "window",
-            f"{low_db:g}..{high_db:g} dB is not within the {worst_db:.2f}..{best_db:.2f} dB that "
-            f"{coder.name} reaches on {clip.scene} (points {points[0]:g} to {points[-1]:g}); "
-            "choose one within them, as with `eval compare --window LOW HIGH`",
+    worst, best = coded(points[-1]), coded(points[0])
+    if not worst.psnr_db() <= low_db <= high_db <= best.psnr_db():
+        raise WindowNotReached(
+            f"{low_db:g}..{high_db:g} dB is not within the {worst.psnr_db():.2f}.."
+            f"{best.psnr_db():.2f} dB that {coder.name} reaches on {clip.scene} (points "
+            f"{points[0]:g} to {points[-1]:g})",
+            _nearest(window_db, worst, best),
         )
     return tuple(points)
+
+
+class WindowNotReached(InvalidInput):
+    """A codec does not reach a window; ``nearest_db`` is a window that all frames reach, if any."""
+
+    def __init__(self, problem: str, nearest_db: Window | None) -> None:
+        super().__init__("window", problem)
+        self.nearest_db = nearest_db
+
+
+def _nearest(window_db: Window, worst: CodedClip, best: CodedClip) -> Window | None:
+    """Return the nearest window of the same width, or a narrower one, that every frame spans."""
+    low_db = math.ceil(10 * min(_frame_psnr_db(worst).max(), LOSSLESS_DB)) / 10
+    high_db = math.floor(10 * min(_frame_psnr_db(best).min(), LOSSLESS_DB)) / 10
+    width_db = window_db[1] - window_db[0]
+    low_db = max(low_db, min(window_db[0], high_db - width_db))
+    high_db = min(high_db, round(low_db + width_db, 1))
+    return (low_db, high_db) if low_db < high_db else None
 
 
 def _frame_psnr_db(coded: CodedClip) -> NDArray[np.float64]:

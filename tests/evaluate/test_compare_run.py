@@ -260,12 +260,16 @@ def test_each_drive_of_a_comparison_keeps_its_background():
     ]
 
 
-def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbnail, tmp_path):
-    job = job_of(thumbnail, tmp_path, window=(15.0, 18.0))
-    with pytest.raises(InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-fast.* reaches"):
+def test_a_window_that_the_field_beats_is_refused_and_the_one_named_works(thumbnail, tmp_path):
+    job = job_of(thumbnail, tmp_path, window=(15.0, 18.0), rivals=("x264-lowdelay",))
+    with pytest.raises(
+        InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-fast.* reaches"
+    ) as caught:
         run_compare(job, Console(quiet=True))
-    assert len(list(job.cells.iterdir())) <= 8, "our own ends alone were coded"
     assert not job.out.exists()
+    low, high = map(float, str(caught.value).partition(" --window ")[2].split()[:2])
+    result = run_compare(replace(job, window=(low, high)), Console(quiet=True))
+    assert {tuple(row["window_db"]) for row in result["rows"]} == {(low, high)}
 
 
 def test_a_background_without_its_drive_is_refused(thumbnail, tmp_path):

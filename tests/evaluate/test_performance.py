@@ -13,12 +13,13 @@ from rfedge.evaluate.performance import (
     TIMED_REPEATS,
     CpuTime,
     Performance,
+    WindowNotReached,
     perform,
     seconds_left,
     spanning_points,
     time_in_turns,
 )
-from rfedge.evaluate.runner import clip_key
+from rfedge.evaluate.runner import clip_key, coded_clip
 from rfedge.jobs import CellStore
 
 PLANE = np.zeros((2, 2), np.uint8)
@@ -78,13 +79,27 @@ def test_points_end_at_the_limits_of_the_codec(store):
     assert points == (45.0, 48.0, 51.0), "one frame at CRF 51 has 10 dB, the clip 9"
 
 
-@pytest.mark.parametrize("window", [(60, 70), (-5, 30)])
-def test_a_window_beyond_the_limits_is_refused_with_what_is_reached(store, window):
-    with pytest.raises(InvalidInput, match=r"ideal reaches on street .*choose one within them"):
-        spanning_points(CLIP, Bounded((20.0, 30.0)), store, window)
+@pytest.mark.parametrize(
+    ("window", "floor_db", "nearest"),
+    [
+        ((60, 70), -math.inf, (48, 58)),
+        ((-5, 30), -math.inf, (10, 39)),
+        ((32, 35), 36.5, (36.5, 39)),
+        ((5, 70), 36.5, (36.5, 58)),
+    ],
+)
+def test_a_window_beyond_the_limits_is_refused_with_the_nearest_that_works(
+    store, window, floor_db, nearest
+):
+    with pytest.raises(WindowNotReached, match=r"ideal reaches on street") as caught:
+        spanning_points(CLIP, Bounded((20.0, 30.0), floor_db), store, window)
+    assert caught.value.nearest_db == pytest.approx(nearest)
+    points = spanning_points(CLIP, Bounded((20.0, 30.0), floor_db), store, nearest)
+    qualities = [coded_clip(CLIP, Bounded(points, floor_db), p, store) for p in points]
+    assert qualities[-1].psnr_db() <= nearest[0] <= nearest[1] <= qualities[0].psnr_db()
 
 
-def test_a_field_that_shows_more_than_the_window_is_named_with_its_lowest_quality(store):
+def test_a_field_that_beats_the_window_is_found_at_the_ends(store):
     coder = Bounded((20.0, 24.0), floor_db=36.5)
     with pytest.raises(InvalidInput, match=r"32\.\.35 dB is not within the 36\.50\.\."):
         spanning_points(CLIP, coder, store, (32, 35))

@@ -6,15 +6,16 @@ first, so that a window that cannot be spanned ends the run before its long part
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import chdir
+from collections.abc import Iterator, Sequence
+from contextlib import chdir, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from rfedge.evaluate.clips import ClipCoder
+from rfcore.errors import InvalidInput
+from rfedge.evaluate.clips import Clip, ClipCoder
 from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.compare.bits import SplitClip, split_rows
 from rfedge.evaluate.compare.drives import (
@@ -35,6 +36,7 @@ from rfedge.evaluate.compare.measure import (
 from rfedge.evaluate.compare.rows import BitShareRow, compare_parts
 from rfedge.evaluate.performance import (
     Performance,
+    WindowNotReached,
     perform,
     seconds_left,
     spanning_points,
@@ -47,6 +49,8 @@ from rfedge.results import rows_of
 
 PARTS = 4
 """A drive's coders are split into so many jobs, each of which renders the drive anew in seconds."""
+WINDOWS_TRIED = 5
+"""Windows that are looked for in place of one that a codec does not reach."""
 
 
 def run_compare(job: EvalCompare, console: Console) -> dict[str, Any]:
@@ -63,8 +67,7 @@ def run_compare(job: EvalCompare, console: Console) -> dict[str, Any]:
     run = Run.begin("compare", job, fields, console)
     _announce(job, comparisons, run)
     run.parallel(_jobs(job), job.processes, job.ray)
-    for comparison in comparisons:
-        _check_window(job, comparison, run)
+    _check_window(job, comparisons, run)
     tables: dict[str, list[Any]] = {}
     for comparison in comparisons:
         for name, rows in _tables(job, comparison, run).items():
@@ -96,7 +99,8 @@ def _code_part(job: EvalCompare, part: int, folder: Path, tell: Tell) -> None:
         every = list({coder.name: coder for coder in comparison.coders}.values())
         for coder in every[part::PARTS]:
             window = _windows_db(job)[0] if coder.name in spanning else None
-            perform(clip, coder, store, window_db=window, timed=False)
+            with suppress(WindowNotReached):  # the check that follows says what to do
+                perform(clip, coder, store, window_db=window, timed=False)
             tell(f"{clip.scene} {clip.rate_hz:g} Hz: {coder.name}")
 
 
@@ -112,17 +116,45 @@ def _announce(job: EvalCompare, comparisons: Sequence[DriveComparison], run: Run
     )
 
 
-def _check_window(job: EvalCompare, comparison: DriveComparison, run: Run) -> None:
+def _check_window(job: EvalCompare, comparisons: Sequence[DriveComparison], run: Run) -> None:
     """Code the ends of every curve, ours first: the field decides how low it can reach."""
-    clip, window = comparison.clip, _windows_db(job)[0]
-    for coder in comparison.compared:
-        points = spanning_points(clip, coder, run.store, window)
+    window = _windows_db(job)[0]
+    for clip, coder in _curves(comparisons):
+        try:
+            points = spanning_points(clip, coder, run.store, window)
+        except WindowNotReached as error:
+            raise InvalidInput(
+                "window", f"{error.problem}; {_remedy(comparisons, run, error)}"
+            ) from error
         added = [f"{point:g}" for point in points if point not in coder.points]
         if added:
             run.tell(
                 f"  {clip.scene} {clip.rate_hz:g} Hz: {coder.name} also at {', '.join(added)}, to "
                 f"span {_in_words(window)}"
             )
+
+
+def _curves(comparisons: Sequence[DriveComparison]) -> Iterator[tuple[Clip, ClipCoder]]:
+    for comparison in comparisons:
+        for coder in comparison.compared:
+            yield comparison.clip, coder
+
+
+def _remedy(comparisons: Sequence[DriveComparison], run: Run, error: WindowNotReached) -> str:
+    """Return what to do, after coding the ends of all curves of the windows that are tried."""
+    nearest_db = error.nearest_db
+    for _ in range(WINDOWS_TRIED):
+        if nearest_db is None:
+            break
+        try:
+            for clip, coder in _curves(comparisons):
+                spanning_points(clip, coder, run.store, nearest_db)
+        except WindowNotReached as another:
+            nearest_db = another.nearest_db
+        else:
+            low_db, high_db = nearest_db
+            return f"all codecs reach --window {low_db:g} {high_db:g} on these drives"
+    return "no other window is reached by all codecs: compare the drives one at a time"
 
 
 def _in_words(window_db: Window) -> str:
