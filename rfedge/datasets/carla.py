@@ -98,7 +98,7 @@ class CarlaRecorder:
             )
         there = self._walk(street.get_waypoint(spawns[self._settings.spawn].location))
         ways = [*there]
-        if self._settings.both_ways:
+        if not self._settings.no_both_ways:
             ways += self._walk(_opposite(there[-1]))
         return [_raised(self._carla, waypoint.transform) for waypoint in ways]
 

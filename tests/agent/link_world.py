@@ -25,7 +25,7 @@ ANSWER_BYTES = 100
 
 @dataclass(frozen=True)
 class Answer:
-    """What a server sends back for a frame."""
+    """The answer of a server to a frame."""
 
     messages: tuple[Ack, Credit]
 

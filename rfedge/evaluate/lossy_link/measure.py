@@ -73,7 +73,7 @@ class LossyLinkRow:
     age_p99_ms: float = field(metadata=shown("p99", ".0f"))
     frozen_percent: float = field(metadata=shown("frozen %", ".1f"))
     psnr_db: float = field(metadata=shown("PSNR dB", ".1f"))
-    """Of the luma of what is shown, over the mean squared error."""
+    """Luma PSNR of the shown pictures, by their mean squared error."""
     streams_lost: int = field(default=0, metadata=shown("streams lost"))
 
 
