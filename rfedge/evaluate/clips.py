@@ -163,8 +163,11 @@ class RunsOfDrive:
 
 
 QUICK = Runs(5, 8, 4)
-"""Part of a drive that ``--quick`` codes. On KITTI's loop, -35.5 % as a whole, such runs are 3 points
-off, 8 if all frames but the first of each counted, and the first eight frames of the drive 26."""
+"""Part of a drive that ``--quick`` codes.
+
+On KITTI's loop, -35.5 % as a whole, such runs are 3 points off, 8 if all frames but the first of
+each counted, and the first eight frames of the drive 26.
+"""
 ONE_RUN = Runs(1, 6)
 """The same where time goes on from frame to frame, as over a link."""
 
