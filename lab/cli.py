@@ -56,9 +56,8 @@ DESCRIPTION = "Experiments whose results are recorded in lab/results."
 
 def parse(arguments: Sequence[str] | None = None) -> Verb:
     """Return the experiment that ``arguments`` ask for, by default those of the process."""
-    return parse_options(
-        Verb, "rfedge-lab", arguments, "Experiments whose results are recorded in lab/results."
-    )
+    verb: Verb = parse_options(Verb, "rfedge-lab", arguments, DESCRIPTION)
+    return verb
 
 
 def main() -> int:

@@ -143,12 +143,8 @@ DESCRIPTION = "Declared streets, rendered with Mitsuba 3 into datasets for rfedg
 
 def parse(arguments: Sequence[str] | None = None) -> Verb:
     """Return the verb that ``arguments`` ask for, by default those of the process."""
-    return parse_options(
-        Verb,
-        "streetgen",
-        arguments,
-        "Declared streets, rendered with Mitsuba 3 into datasets for rfedge.",
-    )
+    verb: Verb = parse_options(Verb, "streetgen", arguments, DESCRIPTION)
+    return verb
 
 
 def main() -> int:
