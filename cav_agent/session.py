@@ -125,7 +125,7 @@ class AgentSession:
         )
         self._job: EncodeJob | None = None
         self._job_is_after: tuple[FrameWriter, FrameAddress | None] = self._writer, None
-        """What will write the job's frame, and the frame that it will be sent after."""
+        """Writer of the job's frame, and the frame that it will be sent after."""
         self._outbox: deque[OutgoingMessage] = deque()
         self._results: deque[FrameResult] = deque()
         self._greeting_until_s = 0.0

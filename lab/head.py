@@ -151,7 +151,7 @@ class EvalHead:
     """Tell the bytes of heads in coded drives, part by part, alone and on a rig of four."""
 
     drives: Annotated[tuple[Path, ...], Positional, arg(metavar="FILE.rfv ...")]
-    """What `rfedge encode` wrote; a drive is called as its file."""
+    """Files that `rfedge encode` wrote; a drive is called as its file."""
     before: Path | None = None
     """JSON with the median and 95th percentile of earlier heads by drive, and their revision."""
     json: Annotated[Path | None, JSON] = None

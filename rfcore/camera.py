@@ -214,7 +214,7 @@ class PoseLattice:
 
 
 LATTICE = PoseLattice()
-"""What senders round to."""
+"""Lattice that senders round poses to."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a frame's head takes from an earlier frame of its camera, its anchor.
+"""Prediction of a frame's head from an earlier frame of its camera, its anchor.
 
 Both ends keep the last ``KEPT_HEADS`` frames of a camera that were sent, or that arrived intact.
 With t1, p1 of the anchor and t0, p0 of the anchor's own anchor, the time is predicted to be t1 +
@@ -30,7 +30,7 @@ _FASTEST = 4
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """What later frames take from one that they name."""
+    """Parts of a head that later frames take from one that they name."""
 
     epoch: int
     sequence: int
@@ -95,7 +95,7 @@ def head_of(frame: Frame, steps: PoseSteps | None, field: int, anchor: Head | No
 
 
 class Prediction:
-    """What a frame's head is predicted to be after ``anchor``."""
+    """Predicted head of a frame after ``anchor``."""
 
     def __init__(self, hello: Hello, camera: int, anchor: Head | None) -> None:
         self._anchor = anchor
