@@ -16,7 +16,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .DELETE_ON_ERROR:
 .SECONDARY:
 .PHONY: results results-full
-results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse lossy-link robust ladder latency compare compare-small)
+results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse lossy-link robust ladder latency head compare compare-small)
 	cp $^ lab/results/
 results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live cold-start world paper)
 	cp $(filter %.json,$^) lab/results/
@@ -203,6 +203,19 @@ $(OUT)/cold-start.json: | $(OUT)
 	$(LAB) cold-start --work $(OUT)/cold-start --out $@
 $(OUT)/world.json: | $(OUT)
 	$(LAB) world --work $(OUT)/world --out $@
+# Heads of frames cost the same whatever the field and the quality: the sample's field serves every drive.
+$(OUT)/head/sample-vehicles.rfv: DRIVE = $(VEHICLES)
+$(OUT)/head/yardstick-empty.rfv: DRIVE = $(YARD)/transforms_drive_empty.json
+$(OUT)/head/yardstick-empty-30hz.rfv: DRIVE = $(YARD)/transforms_drive30_empty.json
+$(OUT)/head/kitti-loop.rfv: DRIVE = $(LOOP)/transforms_second.json
+$(OUT)/head/kitti-city.rfv: DRIVE = $(CITY)/transforms_drive.json
+$(OUT)/head/%.rfv: DRIVE = $(EMPTY)
+$(OUT)/head/%.rfv: | $(OUT)
+	mkdir -p $(@D)
+	$(RFEDGE) encode $(DRIVE) --field $(SAMPLE) --crf 35 --effort fast $(if $(findstring found,$*),--localise) --out $@
+$(OUT)/head.json: $(patsubst %,$(OUT)/head/%.rfv,sample-empty sample-empty-found sample-vehicles \
+		$(if $(DATA),yardstick-empty yardstick-empty-30hz kitti-loop kitti-city))
+	$(LAB) head $^ --before lab/head_before.json --json $@
 BENCH := $(dir $(RFEDGE))python examples/bench_rfedge.py
 $(OUT)/benchmark:
 	$(LAB) benchmark run $@ --name rfedge --points 17 20 23 26 29 32 35 38 41 --prior $(SAMPLE) \
