@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from lab.bench import flattened
 from lab.pages.ladder import ladder_parts, write_ladder_figure
-from lab.report import Draw, Report, bars, folded
+from lab.report import Draw, Report, bars
 from rfcore.errors import InvalidInput
 from rfedge.demo.report import METRIC, SUMMARY, figures_of
 from rfedge.evaluate.compare.figures import write_bd_rates, write_compare_figures
 from rfedge.evaluate.compare.rows import (
     BEST_OF_ANY_CPU,
     HEADLINE_ANCHOR,
+    BitShareRow,
     BreakEvenRow,
     CompareRow,
-    compare_parts,
+    of_first_method,
     of_first_window,
     without_field,
 )
@@ -112,11 +112,45 @@ def _compare_parts(result: Result) -> Iterator[Table | str]:
         drives = dict.fromkeys(row.scene for row in rows)
         lines = [_summary_line(rows, paid, scene) for scene in drives]
         yield text_table(SUMMARY_COLUMNS, lines, "Every drive")
-    for part in compare_parts(result):
-        if isinstance(part, Table) and part.headings[0] == "rival":  # of one drive
-            yield folded(part.title, replace(part, title="").markdown())
-        else:
-            yield part
+    if rows:
+        yield _rivals_table(of_first_method(rows))
+    bits = of_first_method(rows_of(BitShareRow, result.get("bits", ())))
+    if bits:
+        yield _bits_table(bits)
+
+
+def _rivals_table(rows: Sequence[CompareRow]) -> Table:
+    """Return a row for each rival and a column for each drive, and field if there are several."""
+    shown: dict[str, dict[tuple[str, float, str], float]] = {}
+    for row in sorted(rows, key=lambda row: row.rival_setting):
+        of_rival = shown.setdefault(row.rival_setting, {})
+        of_rival[(row.scene, row.hz, row.method)] = row.bd_rate_percent
+    drives = dict.fromkeys((row.scene, row.hz, row.method) for row in rows)
+    several = len(drives) > len({drive[:2] for drive in drives})
+    lines = [
+        [rival, *(f"{of[drive]:+.1f}" if drive in of else "-" for drive in drives)]
+        for rival, of in shown.items()
+    ]
+    names = [
+        f"{scene}, {hz:g} Hz" + (f", field {method.rsplit('-', 1)[-1][:6]}" if several else "")
+        for scene, hz, method in drives
+    ]
+    return text_table(("rival", *names), lines, "BD-rate in percent against each rival")
+
+
+def _bits_table(rows: Sequence[BitShareRow]) -> Table:
+    """Return a row for each drive and field, and a column for each kind of macroblock."""
+    shown: dict[tuple[str, float, str], dict[str, str]] = {}
+    for row in rows:
+        share = f"{row.area_percent:.0f} / {row.slice_percent:.0f}"
+        shown.setdefault((row.scene, row.hz, row.method), {})[row.shows] = share
+    kinds = dict.fromkeys(row.shows for row in rows)
+    lines = [
+        [f"{scene}, {hz:g} Hz", *(of.get(kind, "-") for kind in kinds)]
+        for (scene, hz, _), of in shown.items()
+    ]
+    title = "Macroblocks near 33.5 dB: share of the picture / of the bytes, %"
+    return text_table(("drive", *kinds), lines, title)
 
 
 def _summary_line(rows: list[CompareRow], paid: list[BreakEvenRow], scene: str) -> list[str]:
@@ -224,7 +258,7 @@ def _plain_parts(result: Result) -> Iterator[Table | str]:
 
 
 def _rows_bars(label: str, text: str, value: str) -> Draw:
-    """Return what draws a value of each of a plain result's rows, named by ``text``."""
+    """Return a function that draws a value of each of a plain result's rows, named by ``text``."""
 
     def values(result: Result) -> Iterator[tuple[str, float]]:
         for row in result["rows"]:
@@ -237,8 +271,8 @@ REPORTS = (
     Report(
         "compare",
         "Against x264, x265 and SVT-AV1",
-        "How many bits our coder needs on each drive against rivals at equal quality, and what "
-        "both take of a processor.",
+        "Bits of our coder on each drive against rivals at equal quality, and processor time of "
+        "both. Other methods, windows and SSIM are in the files.",
         _compare_parts,
         _draw_compare,
     ),

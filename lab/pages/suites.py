@@ -156,7 +156,8 @@ def _fault_parts(result: Result) -> Iterator[Table | str]:
         yield _loss(cells)
     yield FAULT_WORDS
     for row in rows:
-        yield _measured(row.fault, row.injected_with, row.held, row.bound, row.measured)
+        if not row.held:
+            yield _measured(row.fault, row.injected_with, row.bound, row.measured)
 
 
 def _kinds(rows: Sequence[FaultRow]) -> Table:
@@ -222,8 +223,8 @@ def _ages(cell: LinkCell) -> tuple[float, float]:
     return cell["age_p50_ms"], cell["age_p99_ms"]
 
 
-def _measured(name: str, how: str, held: bool, bound: str, measured: str) -> str:
-    """Return a case's figures beside their bounds, folded away.
+def _measured(name: str, how: str, bound: str, measured: str) -> str:
+    """Return the figures of a case that does not hold beside their bounds, folded away.
 
     Raises ``InvalidInput`` if a bound lacks its figure.
     """
@@ -231,9 +232,8 @@ def _measured(name: str, how: str, held: bool, bound: str, measured: str) -> str
     if len(bounds) != len(figures):
         counts = f"{len(bounds)} bounds and {len(figures)} figures"
         raise InvalidInput("results", f"{name}: {counts}; each bound needs its figure")
-    verdict = "holds" if held else "**does not hold**"
     figures_table = text_table(("what", "measured"), list(zip(bounds, figures, strict=True)))
-    return folded(f"{name}: {verdict}", f"{how}\n\n{figures_table.markdown()}")
+    return folded(f"{name}: **does not hold**", f"{how}\n\n{figures_table.markdown()}")
 
 
 FAULTS = Report(
@@ -286,8 +286,9 @@ def _attack_parts(result: Result) -> Iterator[Table | str]:
     name = Column("attack", lambda row: row.name)
     yield Table("Attacks", columns(AttackRow, name, *FELT, HOLDS), rows)
     for row in rows:
-        how = f"{row.attack.partition(':')[2].strip()} Certificate: {row.identity}."
-        yield _measured(row.name, how, row.held, row.bound, row.measured)
+        if not row.held:
+            how = f"{row.attack.partition(':')[2].strip()} Certificate: {row.identity}."
+            yield _measured(row.name, how, row.bound, row.measured)
 
 
 FELT = ("bystander_p99_ms", "consumer_p99_ms", "newcomer_s")
