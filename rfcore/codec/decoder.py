@@ -35,6 +35,7 @@ from rfcore.image import I420
 from rfcore.native.yuv import digest_pair
 from rfcore.views import FieldView
 
+_OTHER = "another pose, field or camera, or a class that promises exact renders and breaks it"
 _MEANS_REQUIRED = "between renderers that are not exact the sender must send them"
 
 
@@ -154,7 +155,7 @@ class DeltaDecoder:
             raise PacketRejected(
                 RejectReason.RENDER_MISMATCH,
                 "our render is not the sender's, and the packet has no block means to say by how "
-                f"much: {'another pose, field or camera' if self._exact else _MEANS_REQUIRED}",
+                f"much: {_OTHER if self._exact else _MEANS_REQUIRED}",
             )
         difference = block_mean_difference(block_mean_digest(render), packet.render_block_means)
         rounding_sized = difference <= BLOCK_MEANS_TOLERANCE

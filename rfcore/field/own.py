@@ -81,19 +81,26 @@ class OwnField:
 
     def render(self, camera: Camera, quality: Quality = FULL) -> View:
         """Render; raise ``InvalidInput`` for a view that is not of the declared form."""
-        with self._lock:
-            view = self._renderer.render(camera, quality)
+        try:
+            with self._lock:
+                view = self._renderer.render(camera, quality)
+        except Exception as error:
+            problem = f"{type(error).__name__}: {error}"
+            raise InvalidInput("field", f"{self.name}.render raised {problem}") from error
+        if not isinstance(view, View):
+            kind = type(view).__name__
+            raise InvalidInput("field", f"{self.name}.render returned {kind}, not a View")
         k = camera.intrinsics
         shape = (k.height_px, k.width_px)
         wanted = {"colour": (*shape, 3), "depth": shape, "opacity": shape}
         for key, size in wanted.items():
-            array = getattr(view, key, None)
+            array = getattr(view, key)
             if not isinstance(array, np.ndarray) or (array.shape, array.dtype) != (
                 size,
                 np.float32,
             ):
-                found = getattr(array, "shape", type(array).__name__), getattr(array, "dtype", "")
-                problem = f"{found[1]} {found[0]} must be float32 {size}"
+                found = getattr(array, "dtype", type(array).__name__)
+                problem = f"{found} {np.shape(array)} must be float32 {size}"
                 raise InvalidInput("field", f"{self.name}.render: {key}: {problem}")
             if not np.isfinite(array).all():
                 raise InvalidInput("field", f"{self.name}.render: {key} has NaN or infinite values")

@@ -63,6 +63,16 @@ def test_an_id_that_is_no_digest_is_refused(field_id):
         OwnField(wall, "walls.Wall")
 
 
+def test_an_error_of_the_class_and_a_view_of_another_type_are_one_line():
+    wall = Wall()
+    wall.render = lambda *_: 1 / 0
+    with pytest.raises(InvalidInput, match="render raised ZeroDivisionError"):
+        OwnField(wall, "walls.Wall")
+    wall.render = lambda *_: (1, 2)
+    with pytest.raises(InvalidInput, match="returned tuple, not a View"):
+        OwnField(wall, "walls.Wall")
+
+
 def test_a_class_without_the_members_is_refused_by_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rooms_here.py").write_text("class Empty:\n    pass\n")
