@@ -97,3 +97,10 @@ def test_a_digest_knows_pixels_planes_and_size():
     pictures = [I420(y, c, c), I420(y, changed, c), I420(y, c, changed), wide]
     assert len({picture.digest() for picture in pictures}) == 4
     assert I420(y, c, c).digest() == I420(y.copy(), c.copy(), c.copy()).digest()
+
+
+def test_the_digest_is_the_same_on_every_machine_and_of_the_samples_shown():
+    ramp = np.arange(64, dtype=np.uint8).reshape(8, 8)
+    whole = I420(ramp[:4, :6].copy(), ramp[:2, :3].copy(), ramp[2:4, :3].copy())
+    part = I420(ramp[:4, :6], ramp[:2, :3], ramp[2:4, :3])
+    assert part.digest() == whole.digest() == bytes.fromhex("ee57e1238925474ecea6dcf6ae305b5c")

@@ -3,10 +3,9 @@
 A standard decoder may not notice a lost P slice or a flipped bit in one (ITU-T H.264 does not
 define what damaged streams decode to), so a packet carries digests. Whether it arrived intact is
 checked where it is read (``rfcore.wire.head``), its epoch and sequence by ``check_packet``. The
-receiver then checks that the earlier frame is kept here, the form
-of the payload, and at last the digests of its render and of the decoded picture, which together
-take little longer than one alone. Where decoding fails, a render that is not the sender's is named
-first: it is the likely cause.
+receiver then checks that the earlier frame is kept here, the form of the payload, and at last the
+digests of its render and of the decoded picture. Where decoding fails, a render that is not the
+sender's is named first: it is the likely cause.
 
 With inexact renderers an error would spread from frame to frame, so then frames may be predicted
 from the render only.
@@ -32,7 +31,6 @@ from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
-from rfcore.native.yuv import digest_pair
 from rfcore.views import FieldView
 
 _OTHER = "another pose, field or camera, or a class that promises exact renders and breaks it"
@@ -115,7 +113,7 @@ class DeltaDecoder:
             made_ns = self._clock_ns()
             spliced_ns, frame = self._reconstruct(packet, pictures)
         except PacketRejected:
-            self._check_render(packet, render, render.digest())
+            self._check_render(packet, render)
             raise
         made, same_render = self._checked(packet, render, prediction, frame)
         stage_ns = {
@@ -133,9 +131,9 @@ class DeltaDecoder:
 
         Raises ``PacketRejected`` for a render or picture that is not the sender's.
         """
-        render_digest, digest = digest_pair(render, frame)
+        digest = frame.digest()
         try:
-            same_render = self._check_render(packet, render, render_digest)
+            same_render = self._check_render(packet, render)
             if same_render and not digest.startswith(packet.reconstruction_digest):
                 raise PacketRejected(
                     RejectReason.RECONSTRUCTION_MISMATCH,
@@ -146,10 +144,10 @@ class DeltaDecoder:
             raise
         return prediction.past_of(frame, digest), same_render
 
-    def _check_render(self, packet: DeltaPacket, render: I420, digest: bytes) -> bool:
+    def _check_render(self, packet: DeltaPacket, render: I420) -> bool:
         """Return whether the renders are identical; raise if the packet cannot be decoded with
         ours."""
-        if digest.startswith(packet.render_digest):
+        if render.digest().startswith(packet.render_digest):
             return True
         if not packet.render_block_means:
             raise PacketRejected(

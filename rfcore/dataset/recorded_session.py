@@ -11,8 +11,8 @@ once its file is whole; a last line without an end is one that is being written,
 
 Poses are world_from_cam with OpenCV camera axes in the world of the fields, their tiles' origins
 added in float64; a camera that was lost has ``null`` for both, and its picture is left out of the
-dataset. ``digest`` is BLAKE2b-128 of the reconstructed I420 picture. Times never go back within a
-file.
+dataset. ``digest`` is XXH3-128 of the reconstructed picture (``I420.digest``). Times never go back
+within a file.
 """
 
 from __future__ import annotations

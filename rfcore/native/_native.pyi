@@ -252,10 +252,6 @@ class SliceCoder:
         modes: NDArray[np.int8],
     ) -> bytes: ...
 
-# --- blake2b ----------------------------------------------------------------
-
-def blake2b_pair(head: bytes, first: list[_U8], second: list[_U8]) -> tuple[bytes, bytes]: ...
-
 # --- pcm --------------------------------------------------------------------
 
 def pcm_macroblocks(y: _U8, u: _U8, v: _U8, out: _U8) -> None: ...

@@ -311,8 +311,13 @@ class Drive:
 
 
 def frames_digest(frames: Sequence[I420]) -> str:
-    """Return the sha256 over the frames' digests."""
-    return hashlib.sha256(b"".join(frame.digest() for frame in frames)).hexdigest()
+    """Return SHA-256 over BLAKE2b-128 of each frame: its size as text, then its planes."""
+    total = hashlib.sha256()
+    for frame in frames:
+        one = hashlib.blake2b(f"{frame.size_px}".encode(), digest_size=16)
+        one.update(frame.packed())
+        total.update(one.digest())
+    return total.hexdigest()
 
 
 def read_drive(name: DriveName | str, limit: int | Runs | None = None) -> Drive:

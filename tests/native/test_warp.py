@@ -1,5 +1,6 @@
 """The warp against its definition in numpy, bit by bit; its geometry against plane homographies."""
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -153,11 +154,16 @@ def test_the_correction_is_its_definition_bit_by_bit(size_px):
     assert equal(corrected, definition(previous, before, now, minus=was))
 
 
+def fingerprint(picture):
+    message = f"{picture.size_px}".encode() + picture.packed()
+    return hashlib.blake2b(message, digest_size=16).hexdigest()
+
+
 def test_golden_digests_pin_the_bytes():
     previous, before, now = scene((64, 48), 7)
     corrected = correct_i420(previous, replace(before, render=now.render), now)
-    assert corrected.digest().hex() == "c805d5b0e1a577d46842018c3f0ec45d"
-    assert warp_i420(*scene((64, 48), 7)).digest().hex() == "2ee3f6ae0a6fb2fd569311b8eea77a8b"
+    assert fingerprint(corrected) == "c805d5b0e1a577d46842018c3f0ec45d"
+    assert fingerprint(warp_i420(*scene((64, 48), 7))) == "2ee3f6ae0a6fb2fd569311b8eea77a8b"
 
 
 def test_what_another_surface_hid_comes_from_the_render():

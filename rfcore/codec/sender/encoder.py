@@ -56,7 +56,6 @@ from rfcore.codec.sender.reference_choice import (
 )
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
-from rfcore.native.yuv import digest_pair
 from rfcore.views import FieldView
 
 
@@ -233,12 +232,12 @@ class DeltaEncoder:
         made, rate = self._coded(costs, plan, choice)
         encoded_ns = self._clock_ns()
         reconstruction = self._reconstruction(plan.pictures, made.coded)
-        render_digest, digest = digest_pair(view.render, reconstruction)
+        digest = reconstruction.digest()
         past = plan.prediction.past_of(reconstruction, digest)
         packet = DeltaPacket(
             epoch=state.epoch,
             sequence=state.next_sequence,
-            render_digest=render_digest[:RENDER_DIGEST_BYTES],
+            render_digest=view.render.digest()[:RENDER_DIGEST_BYTES],
             render_block_means=block_mean_digest(view.render) if choice.block_means else b"",
             reconstruction_digest=digest[:RECONSTRUCTION_DIGEST_BYTES],
             payload=made.coded.payload,

@@ -4,7 +4,6 @@
 namespace nb = nanobind;
 
 namespace rfcore {
-void bind_blake2b(nb::module_& m);
 void bind_h264(nb::module_& m);
 void bind_live_view(nb::module_& m);
 void bind_ngp(nb::module_& m);
@@ -16,7 +15,6 @@ void bind_yuv(nb::module_& m);
 
 NB_MODULE(_native, m) {
     m.doc() = "Bit-exact kernels of rfcore; use the wrappers in rfcore.native.";
-    rfcore::bind_blake2b(m);
     rfcore::bind_h264(m);
     rfcore::bind_live_view(m);
     rfcore::bind_ngp(m);

@@ -141,7 +141,7 @@ class TwinPicture(_message.Message):
     field_id: _builtins.str
     """Lower-case hexadecimal sha256 of the field it was coded against."""
     reconstruction_digest: _builtins.bytes
-    """BLAKE2b-128 of the I420 planes."""
+    """XXH3-128 of "(width, height)" and the I420 planes, big-endian."""
     encoding: Global___PictureEncoding.ValueType
     picture: _builtins.bytes
     skipped: _builtins.int
