@@ -34,6 +34,7 @@ from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.metrics import ssim
+from rfcore.wire.head_prediction import KEPT_HEADS
 from rfedge.evaluate.field_coder import MessageWriter, RenderedClip
 from rfedge.offline import Arrival, decode_frames
 
@@ -231,6 +232,8 @@ class LossySender:
         render_only = self._policy is Policy.RENDER_ONLY
         for index in range(len(self._crossing.frames)):
             base = self.feedback.base(self._policy)
+            if base is not None and index - base > KEPT_HEADS:
+                base = None  # no longer named by a head
             made = self._coder.code(index, pasts.get(base), render_only=render_only)
             pasts[index] = made.state.past
             arrival = self._coder.arrival(index, made)

@@ -224,6 +224,6 @@ async def test_a_light_goes_on_where_its_transfer_broke(
                 await asyncio.sleep(0.001)
             await cache.close()
     resumed = offsets[3]
-    assert resumed in (CHUNK_BYTES, 2 * CHUNK_BYTES)
+    assert 0 < resumed <= 2 * CHUNK_BYTES
     assert offsets[3:5] == [resumed, resumed + CHUNK_BYTES]
     assert FieldStore(mine).path(dusk_id).read_bytes() == (tmp_path / "dusk.rff").read_bytes()

@@ -82,11 +82,11 @@ def test_what_is_found_nowhere_asks_which_axis_is_up(tmp_path, monkeypatch):
     (tmp_path / "images").mkdir()
     write_png(tmp_path / "images" / "0.png", noise)
     settings, said = register.RegisterSettings("PINHOLE", tuple(PINHOLE), "y"), []
-    with pytest.raises(DatasetError, match=r"where y is taken to be up.*--up z or y or -y"):
+    with pytest.raises(DatasetError, match=r"where y is up.*--up z or y or -y"):
         register.register_pictures(
             tmp_path / "images", tmp_path / "out", load_field(FIELD), settings, said.append
         )
-    assert said[-1] == "not found in the whole field, where y is taken to be up (--up)"
+    assert said[-1] == "not found in the whole field, where y is up (--up)"
     assert not (tmp_path / "out").exists()
 
 
