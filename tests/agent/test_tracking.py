@@ -89,10 +89,10 @@ def states_while_searching(
 
 
 def again_at(captures: list[Capture], first: int) -> list[Capture]:
-    """Return pictures from ``first`` on, at the times of those from frame 3 on."""
+    """Return pictures from ``first`` on, at the times of those from frame 4 on."""
     return [
         replace(at, picture=capture.picture)
-        for capture, at in zip(captures[first:], captures[3:], strict=False)
+        for capture, at in zip(captures[first:], captures[4:], strict=False)
     ]
 
 
@@ -119,9 +119,10 @@ def test_after_a_jump_the_field_is_used_again_within_three_frames(
     held = HeldExecutor()
     intrinsics = captures[0].picture.camera.intrinsics
     tracking = CameraTracking(field, intrinsics, DatasetPoses(), held)
-    for capture in captures[:3]:
+    for capture in captures[:4]:
         held.run()
-        located(tracking, capture)
+        before = located(tracking, capture)
+    assert before.state is LocalisationState.TRACKING
     held.run()
     states = states_while_searching(tracking, held, again_at(captures, 13))
     assert states == [LocalisationState.LOCALISING] * 3 + [LocalisationState.TRACKING] * (
