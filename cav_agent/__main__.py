@@ -10,8 +10,7 @@ import structlog
 
 from cav_agent.config import AgentConfig
 from cav_agent.vehicle import Vehicle
-from rfcore.program import parse_options, run_program
-from rfcore.wire.settings import configure_logs, words_of_command_line
+from rfcore.program import run_program, service_options
 
 
 def main() -> int:
@@ -20,11 +19,7 @@ def main() -> int:
 
 
 def _run() -> None:
-    words = words_of_command_line(sys.argv[1:])
-    config: AgentConfig = parse_options(AgentConfig, "cav-agent", words)
-    configure_logs(sys.stderr, config.log)
-    config.render.check()
-    asyncio.run(drive(config))
+    asyncio.run(drive(service_options(AgentConfig, "cav-agent")))
 
 
 async def drive(config: AgentConfig) -> None:

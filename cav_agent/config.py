@@ -15,7 +15,13 @@ from rfcore.codec.h264.config import CRF_RANGE, CoderSettings
 from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.errors import InvalidInput
 from rfcore.named_class import is_named_class
-from rfcore.wire.settings import CONFIG, LogForm, MetricsSettings, RenderSettings, TransportSettings
+from rfcore.wire.settings import (
+    OPTIONS_FILE,
+    LogForm,
+    MetricsSettings,
+    RenderSettings,
+    TransportSettings,
+)
 from rfcore.wire.values import check_field_id, check_name
 
 
@@ -114,7 +120,7 @@ class AgentConfig:
     live: LiveSettings = LiveSettings()
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
-    config: Annotated[Path | None, CONFIG] = None
+    config: Annotated[Path | None, OPTIONS_FILE] = None
     """Take options from this TOML file, too: KEY = VALUE, as rate = 5. The command line wins."""
     report: Path | None = None
     """File for one JSON line per picture."""

@@ -124,7 +124,7 @@ class FieldCache:
         tile, loop = served.tile, asyncio.get_running_loop()
         own = ArrivingField()
         preview: tuple[str, ...] = ()
-        if self._needs_all or await self._holds(tile.field_id):
+        if self._own or self._needs_all or await self._holds(tile.field_id):
             field = await self._opened(served, (tile.field_id,))
         elif tile.preview is not None:
             preview = tile.preview.field_ids
@@ -153,8 +153,6 @@ class FieldCache:
         return await own.first
 
     async def _holds(self, field_id: str) -> bool:
-        if self._own is not None:
-            return True
         store = FieldStore(self._config.fields.expanduser())
         return field_id in await asyncio.to_thread(store.ids)
 

@@ -16,7 +16,7 @@ import structlog
 
 from cav_agent.config import AgentConfig
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError, UnknownField
-from rfcore.wire.address import Address, check_handshake
+from rfcore.wire.address import ASK_AFTER_S, Address, check_handshake
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RECONNECT_S, RETRY_AFTER, VEHICLE
 from rfcore.wire.tiles import MAX_TILES, Tile, tile_of
 from rfcore.wire.tls import TlsFiles
@@ -26,9 +26,6 @@ from rfcore.wire.values import check_field_id
 from rfcore.wire.waits import WaitLog, log_wait, waiting
 
 log = structlog.get_logger()
-
-ASK_AFTER_S = 1.0
-"""Period at which the vehicle checks why it has no connection; gRPC tries again more often."""
 
 REFUSED = (grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED)
 

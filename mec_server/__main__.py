@@ -7,8 +7,7 @@ import sys
 
 from mec_server.config import ServerConfig
 from mec_server.server import serve
-from rfcore.program import parse_options, run_program
-from rfcore.wire.settings import configure_logs, words_of_command_line
+from rfcore.program import run_program, service_options
 
 
 def main() -> int:
@@ -17,11 +16,7 @@ def main() -> int:
 
 
 def _run() -> None:
-    words = words_of_command_line(sys.argv[1:])
-    config: ServerConfig = parse_options(ServerConfig, "mec-server", words)
-    configure_logs(sys.stderr, config.log)
-    config.render.check()
-    asyncio.run(serve(config))
+    asyncio.run(serve(service_options(ServerConfig, "mec-server")))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,13 @@ from tyro.conf import Suppress, arg
 from rfcore.errors import InvalidInput
 from rfcore.update.run import LearnAs
 from rfcore.wire.nats import NatsServers
-from rfcore.wire.settings import CONFIG, LogForm, MetricsSettings, RenderSettings, TransportSettings
+from rfcore.wire.settings import (
+    OPTIONS_FILE,
+    LogForm,
+    MetricsSettings,
+    RenderSettings,
+    TransportSettings,
+)
 from rfcore.wire.values import MAX_RATE_HZ, check_name, check_range
 
 
@@ -261,7 +267,7 @@ class ServerConfig:
     """Decode in a sandbox though the server runs as root; refused otherwise."""
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
-    config: Annotated[Path | None, CONFIG] = None
+    config: Annotated[Path | None, OPTIONS_FILE] = None
     """Take options from this TOML file, too: KEY = VALUE, as record_max_gb = 5. The command line
     wins."""
     ready_file: Path | None = None

@@ -78,6 +78,20 @@ def parse_options(
     return tyro.cli(kind, prog=name, description=description, args=arguments, config=CONFIG)
 
 
+def service_options(kind: Any, name: str) -> Any:
+    """Return the options of service ``name``, of its command line and its ``--config`` file.
+
+    Its logs have their form from now on, and what renders was found to be there. Raises
+    ``RfedgeError`` for what cannot be.
+    """
+    from rfcore.wire.settings import configure_logs, words_of_command_line
+
+    config = parse_options(kind, name, words_of_command_line(sys.argv[1:]))
+    configure_logs(sys.stderr, config.log)
+    config.render.check()
+    return config
+
+
 def run_program(name: str, work: Callable[[], None]) -> int:
     """Do ``work``, which begins with parsing the command line, and return the exit status."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # so that a log file gets each line at once

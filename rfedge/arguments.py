@@ -19,7 +19,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
@@ -46,6 +46,8 @@ RFF = arg(metavar="FILE.rff")
 PLY = arg(metavar="FILE.ply")
 SPLATS = arg(metavar="FILE.ply|.spz")
 JSON = arg(metavar="FILE.json")
+Up = Literal["z", "y", "-y"]
+"""An axis that points up (``rfedge.fields.viewpoints.UPS``)."""
 
 IMPORTED = Path("out/fields")
 """Folder of the fields that ``rfedge field import`` writes."""

@@ -21,6 +21,9 @@ from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.values import shown
 
+ASK_AFTER_S = 1.0
+"""Period at which a client without a connection finds out why; gRPC tries again more often."""
+
 
 @dataclass(frozen=True)
 class Address:

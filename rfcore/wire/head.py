@@ -79,7 +79,7 @@ from rfcore.codec.packet import (
     DeltaPacket,
 )
 from rfcore.codec.photometric import COEFFICIENTS, MOST_LIGHT_BYTES
-from rfcore.codec.references import Reference, References
+from rfcore.codec.references import Reference, References, is_temporal
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.field.quality import DETAILS, SCALES, Quality
 from rfcore.wire.bits import BitReader, BitWriter, ByteReader
@@ -255,7 +255,7 @@ class FrameReader:
         light, payload = behind.take(light_bytes), behind.rest()
         check_range("frame.payload bytes", len(payload), 0, MAX_PAYLOAD_BYTES)
         references, relit = REFERENCE_CODES[code], light_kind in (_LEARNT, _SENT)
-        needs_base = light_kind == _LEARNT or any(r is not Reference.RENDER for r in references)
+        needs_base = light_kind == _LEARNT or is_temporal(references)
         if needs_base and anchor is None:
             raise InvalidInput("frame.references", "need an earlier frame, and none is named")
         packet = DeltaPacket(

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import logging
 import tomllib
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -28,8 +28,7 @@ from rfcore.raster.renderers import CPU, renderer_isa
 from rfcore.wire.tls import TlsFiles
 
 PORT_MAX = 65535
-CONFIG_FILE = "--config"
-CONFIG = arg(metavar="FILE.toml")
+OPTIONS_FILE = arg(metavar="FILE.toml")
 
 
 def words_of_command_line(words: Sequence[str]) -> list[str]:
@@ -39,10 +38,9 @@ def words_of_command_line(words: Sequence[str]) -> list[str]:
     flag, a list gives several values. Options of the command line come later, and win. Raises
     ``InvalidInput`` naming the file, and the key that is no option's value.
     """
-    after = dict(pairwise(words)).get(CONFIG_FILE, "")
-    name = after or next(
-        (w.partition("=")[2] for w in words if w.startswith(f"{CONFIG_FILE}=")), ""
-    )
+    finder = ArgumentParser(add_help=False, allow_abbrev=False)
+    finder.add_argument("--config", nargs="?")
+    name = finder.parse_known_args(words)[0].config
     if not name:
         return list(words)
     try:

@@ -16,7 +16,7 @@ from typing import Any
 import grpc
 
 from rfcore.errors import AccessDenied, RfedgeError
-from rfcore.wire.address import Address, check_handshake
+from rfcore.wire.address import ASK_AFTER_S, Address, check_handshake
 from rfcore.wire.conventions import CONSUMER_OPTIONS, MAY_SEE
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import (
@@ -39,8 +39,6 @@ from rfcore.wire.twin_render import (
 from rfcore.wire.v1 import twin_pb2_grpc
 
 CONNECT_S = 10.0
-ASK_AFTER_S = 1.0
-"""Period at which a client without a connection finds out why."""
 RENDER_TIMEOUT_S = 30.0
 Metadata = Iterable[tuple[str, str | bytes]]
 REFUSED = (

@@ -85,13 +85,6 @@ def check_bytes(field: str, value: bytes, shortest: int, longest: int) -> bytes:
     return value
 
 
-def check_absent_or(field: str, value: bytes, length: int) -> bytes:
-    """Return ``value`` if it is ``length`` bytes long, or empty because it was left out."""
-    if len(value) not in (0, length):
-        raise InvalidInput(field, f"{len(value)} bytes, expected 0 or {length}")
-    return value
-
-
 def check_range(field: str, value: float, lowest: float, highest: float) -> float:
     """Return ``value`` if it is in ``lowest..highest``; NaN never is."""
     if not lowest <= value <= highest:

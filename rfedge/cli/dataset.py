@@ -14,6 +14,7 @@ from rfedge.arguments import (
     DATASET,
     FOLDER,
     SIZE,
+    Up,
     field_path,
     is_field_file,
     open_field,
@@ -97,7 +98,7 @@ class DatasetPoses:
     """COLMAP camera model of the new pictures, where it is not the dataset's camera."""
     parameters: Annotated[tuple[float, ...], arg(metavar="NUMBER ...")] = ()
     """Known parameters of that model in COLMAP's order, which are held; default: estimated."""
-    up: Literal["z", "y", "-y"] | None = None
+    up: Up | None = None
     """Axis that points up in the field registered to; default: as its training cameras show it."""
     per_second: float = 2.0
     """Pictures to take of each second of a video."""

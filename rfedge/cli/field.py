@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
@@ -15,6 +15,7 @@ from rfedge.arguments import (
     RFF,
     SIZE,
     SPLATS,
+    Up,
     field_path,
     max_field_bytes,
     open_drive,
@@ -52,7 +53,7 @@ class FieldImport:
     """nerfstudio's dataparser_transforms.json, to bring the field back to its world."""
     tile_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """East, north and up of the tile's origin, m, subtracted in float64."""
-    up: Literal["z", "y", "-y"] | None = None
+    up: Up | None = None
     """Axis that points up; default: z."""
     antialiased: bool = False
     """The field was trained with antialiased rasterization (gsplat, Mip-Splatting), and the file's

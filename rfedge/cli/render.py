@@ -13,6 +13,7 @@ from rfedge.arguments import (
     FIELD,
     RENDERER,
     SIZE,
+    Up,
     check_folder,
     open_drive,
     open_field,
@@ -38,7 +39,7 @@ class Render:
     """Number of pictures of an orbit."""
     size: Annotated[str, SIZE] = "960x540"
     """Size of an orbit's pictures, px; those of a drive have the size of its camera."""
-    up: Literal["z", "y", "-y"] | None = None
+    up: Up | None = None
     """Axis of the field that points up (orbit); default: as its training cameras show it."""
     rate_hz: float = 24.0
     """Pictures per second of the MP4."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from rfedge.arguments import ADDRESS, DATASET, FOLDER, TwinConnection, open_drive
+from rfedge.arguments import ADDRESS, DATASET, FOLDER, TwinConnection, Up, open_drive
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,7 +40,7 @@ class Twin:
     """End when this process has ended, too."""
     rate_hz: float = 10.0
     """Pictures a second of a drive."""
-    up: Literal["z", "y", "-y"] | None = None
+    up: Up | None = None
     """Axis that points up; default: as the field's training cameras show it, else the drive's."""
     threads: int = 1
     """Threads that render a field for comparison."""

@@ -32,6 +32,7 @@ from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive, read_drive, write_drive
 from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import (
+    OUR_CONTRACT,
     Ack,
     CameraDescription,
     Credit,
@@ -39,7 +40,6 @@ from rfcore.wire.messages import (
     FrameAddress,
     Hello,
     Nack,
-    RendererContract,
     ServerMessage,
 )
 from rfedge.arguments import open_drive
@@ -309,5 +309,4 @@ def payload_drive(field_id: str, size_bytes: int) -> PrerecordedDrive:
 
 
 def _hello(camera: CameraDescription, field_id: str) -> Hello:
-    contract = RendererContract(RENDERER_CONTRACT, exact=True)
-    return Hello(VEHICLE, (camera,), (field_id,), contract)
+    return Hello(VEHICLE, (camera,), (field_id,), OUR_CONTRACT)

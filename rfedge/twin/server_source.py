@@ -23,10 +23,11 @@ from cav_agent.field_fetch import fetch_field
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
 from rfcore.field import FieldStore
 from rfcore.perception.objects import CameraKey
+from rfcore.wire.address import ASK_AFTER_S
 from rfcore.wire.conventions import RECONNECT_S
 from rfcore.wire.tiles import LearntLight, Tile, TileLight, learnt_of, tile_of
 from rfcore.wire.twin import Departure, TwinPicture
-from rfcore.wire.twin_client import ASK_AFTER_S, AsyncTwinClient
+from rfcore.wire.twin_client import AsyncTwinClient
 from rfcore.wire.twin_render import (
     NO_AGE,
     ObjectsRequest,

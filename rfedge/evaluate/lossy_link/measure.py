@@ -31,18 +31,17 @@ from rfcore.link.lossy import LossyLink, PacketLoss
 from rfcore.link.plan import DirectionPlan, LinkPlan
 from rfcore.link.shaper import Connection, LinkProfile
 from rfcore.views import PosedPicture
-from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import (
+    OUR_CONTRACT,
     Ack,
     CameraDescription,
     Credit,
     Frame,
     Hello,
-    RendererContract,
     StageTimes,
     Welcome,
 )
-from rfedge.evaluate.clips import Drive, psnr_of_mse, read_drive
+from rfedge.evaluate.clips import Drive, luma_mse, psnr_of_mse, read_drive
 from rfedge.evaluate.field_coder import RenderedClip, render_clip
 from rfedge.evaluate.lossy_link import EvalLossyLink
 from rfedge.evaluate.runner import Run, program_version
@@ -179,8 +178,7 @@ class LossyDrive:
         config = CodecConfig(k.width_px, k.height_px)
         self._pipeline = Pipeline(renderer, config, lambda: 0)
         camera = CameraDescription(CAMERA, k, self._pipeline.header, drive.name.rate_hz)
-        contract = RendererContract(RENDERER_CONTRACT, exact=True)
-        hello = Hello("cav-1", (camera,), ("0" * 64,), contract)
+        hello = Hello("cav-1", (camera,), ("0" * 64,), OUR_CONTRACT)
         control = RateControl(job.max_delay_ms / 1e3)
         self._session = AgentSession(hello, AgentLimits(), control)
         self._decoder = DeltaDecoder(self._pipeline.header)
@@ -295,8 +293,8 @@ class LossyDrive:
         index = self._capture(number).index
         decoded = self._decoder.decode(self._state, frame.packet, self._rendered.views[index])
         self._state = decoded.state
-        error = decoded.frame.y.astype(np.float64) - self._drive.frames[index].y
-        self.shown.append(Picture(captured_s, now, size_bytes, float(np.square(error).mean())))
+        mse = luma_mse(decoded.frame, self._drive.frames[index])
+        self.shown.append(Picture(captured_s, now, size_bytes, mse))
         self._answered += 1
         ack = Ack(frame.address, StageTimes(), frame.packet.reconstruction_digest)
         credit = Credit(CAMERA, WINDOW + self._answered)
