@@ -40,7 +40,7 @@ def decode(field_file: Path, packets: Path, out: Path) -> None:
     ends = 2 + int.from_bytes(first[:2], "big")
     hello = client_message_from_bytes(first[2:ends])
     reader = FrameReader(hello)
-    frames = [reader.frame(client_message_from_bytes(m)) for m in (first[ends:], *more)]
+    frames = [reader.read(client_message_from_bytes(m)) for m in (first[ends:], *more)]
     for index, shown in enumerate(
         decode_drive(CodedDrive(hello, tuple(frames)), load_field(field_file))
     ):

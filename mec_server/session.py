@@ -148,7 +148,7 @@ class ServerSession:
         self._heard_s = now
         if isinstance(message, Hello):
             self._receive_hello(message)
-        else:
+        elif isinstance(message, Frame):
             self._receive_frame(message, now)
 
     def refuse(self, error: InvalidInput | FrameRefused, now: float) -> None:

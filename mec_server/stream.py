@@ -41,7 +41,14 @@ from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
 from rfcore.wire.head import FrameReader, FrameRefused
-from rfcore.wire.messages import Frame, FrameAddress, Hello, RendererContract
+from rfcore.wire.messages import (
+    Frame,
+    FrameAddress,
+    Hello,
+    PackedFrame,
+    PoseAhead,
+    RendererContract,
+)
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.tls import peer_identity
 
@@ -278,7 +285,7 @@ class Stream:
         excess = self._excess(lambda: self._account.spend_message(len(data), now))
         try:
             message = client_message_from_bytes(data)
-            frame = self._frame(message) if isinstance(message, bytes) else None
+            frame = None if isinstance(message, Hello) else self._frame(message)
         except FrameRefused as error:
             self._log_rejected(error.address, error)
             self._session.refuse(error, now)
@@ -290,13 +297,13 @@ class Stream:
         else:
             if isinstance(message, Hello):
                 self._receive_hello(message, excess, now)
-            elif frame is not None:
+            elif isinstance(frame, Frame):
                 self._receive_frame(frame, len(data), excess, now)
 
-    def _frame(self, data: bytes) -> Frame:
+    def _frame(self, packed: PackedFrame) -> Frame | PoseAhead:
         if self._reader is None:
             raise ProtocolError("a frame came before Hello")
-        return self._reader.frame(data)
+        return self._reader.read(packed)
 
     def _excess(self, spend: Callable[[], None]) -> LimitExceeded | None:
         """Return the limit that ``spend`` exceeds, if it does: counted, and logged once."""

@@ -16,7 +16,7 @@ from rfcore.camera import Pose, PoseLattice
 from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.errors import InvalidInput
-from rfcore.wire.messages import CameraDescription, Hello, RendererContract
+from rfcore.wire.messages import CameraDescription, Hello, PackedFrame, RendererContract
 from rfcore.wire.v1 import edge_pb2 as pb
 from rfcore.wire.values import (
     MAX_CAMERAS,
@@ -34,8 +34,8 @@ from rfcore.wire.values import (
 )
 
 
-def client_message_from_bytes(data: bytes) -> Hello | bytes:
-    """Return the Hello that a vehicle sent, or the bytes of a frame (``rfcore.wire.head``).
+def client_message_from_bytes(data: bytes) -> Hello | PackedFrame:
+    """Return the Hello that a vehicle sent, or a packed frame (``rfcore.wire.head``).
 
     Raises ``InvalidInput`` for anything else, and for a Hello with a bad value.
     """
@@ -47,14 +47,16 @@ def client_message_from_bytes(data: bytes) -> Hello | bytes:
     return client_message_from_wire(request)
 
 
-def client_message_from_wire(request: pb.StreamRequest) -> Hello | bytes:
+def client_message_from_wire(request: pb.StreamRequest) -> Hello | PackedFrame:
     """Return what a vehicle sent; raises as ``client_message_from_bytes``."""
     match request.WhichOneof("message"):
         case "hello":
             return _hello_from_wire(request.hello)
         case "frame":
-            return request.frame
-    raise InvalidInput("message", "is neither hello nor frame")
+            return PackedFrame(request.frame)
+        case "pose_ahead":
+            return PackedFrame(request.pose_ahead, is_ahead=True)
+    raise InvalidInput("message", "is neither hello nor frame nor pose_ahead")
 
 
 def hello_to_bytes(hello: Hello) -> bytes:

@@ -24,7 +24,7 @@ from rfcore.files import whole_file
 from rfcore.wire.conventions import MAX_MESSAGE_BYTES
 from rfcore.wire.convert import client_message_from_wire, hello_to_bytes
 from rfcore.wire.head import FrameReader, FrameRefused, FrameWriter
-from rfcore.wire.messages import Frame, Hello
+from rfcore.wire.messages import Frame, Hello, PackedFrame
 from rfcore.wire.v1 import edge_pb2 as pb
 
 MAGIC = b"RFV1\r\n\x1a\n"
@@ -76,10 +76,11 @@ def read_drive(path: Path) -> CodedDrive:
             raise InvalidData(f"{path}: message 0 is not a Hello")
         reader, frames = FrameReader(hello), []
         for number, message in enumerate(messages, 1):
-            if isinstance(message, Hello):
-                raise InvalidData(f"{path}: message {number} is a second Hello")
+            if isinstance(message, Hello) or message.is_ahead:
+                what = "second Hello" if isinstance(message, Hello) else "pose ahead"
+                raise InvalidData(f"{path}: message {number} is a {what}")
             try:
-                frames.append(reader.frame(message))
+                frames.append(reader.frame(message.data))
             except FrameRefused as error:
                 raise InvalidData(f"{path}: message {number}: {error}") from error
     return CodedDrive(hello, tuple(frames))
@@ -105,7 +106,7 @@ class _BoundedReader:
         return data
 
 
-def _messages(file: BinaryIO, path: Path) -> Iterator[Hello | bytes]:
+def _messages(file: BinaryIO, path: Path) -> Iterator[Hello | PackedFrame]:
     reader, number = _BoundedReader(file), 0
     while True:
         try:

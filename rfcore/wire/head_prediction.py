@@ -16,7 +16,7 @@ from math import isqrt
 
 from rfcore.camera import PoseSteps
 from rfcore.field.quality import FULL, Quality
-from rfcore.wire.messages import Frame, Hello
+from rfcore.wire.messages import Hello, PoseAhead
 from rfcore.wire.values import clock_to_wire, localisation_to_wire
 
 KEPT_HEADS = 16
@@ -40,10 +40,10 @@ class Head:
     quality: Quality
     instant: int
     sensing: int
-    digest: bytes
-    """The first bytes of the picture's."""
     before: tuple[int, PoseSteps | None] | None
     """Time and pose of its own anchor."""
+    digest: bytes = b""
+    """The first bytes of the picture's; empty until the frame was coded."""
 
 
 class KeptHeads:
@@ -78,18 +78,17 @@ class KeptHeads:
         return epoch, sequence + (sequence_bits - sequence & 255)
 
 
-def head_of(frame: Frame, steps: PoseSteps | None, field: int, anchor: Head | None) -> Head:
-    packet = frame.packet
+def head_of(ahead: PoseAhead, steps: PoseSteps | None, field: int, anchor: Head | None) -> Head:
+    """Return the head of a frame that is not coded yet."""
     return Head(
-        epoch=packet.epoch,
-        sequence=packet.sequence,
-        time_us=frame.capture_time_ns // 1000,
+        epoch=ahead.epoch,
+        sequence=ahead.sequence,
+        time_us=ahead.capture_time_ns // 1000,
         pose=steps,
         field=field,
-        quality=frame.quality,
-        instant=frame.instant,
-        sensing=clock_to_wire(frame.clock) << 2 | localisation_to_wire(frame.localisation),
-        digest=packet.reconstruction_digest,
+        quality=ahead.quality,
+        instant=ahead.instant,
+        sensing=clock_to_wire(ahead.clock) << 2 | localisation_to_wire(ahead.localisation),
         before=None if anchor is None else (anchor.time_us, anchor.pose),
     )
 

@@ -116,6 +116,22 @@ class Frame:
         """Return camera, epoch and sequence."""
         return FrameAddress(self.camera_id, self.packet.epoch, self.packet.sequence)
 
+    @property
+    def ahead(self) -> PoseAhead:
+        """Return what could be sent ahead of it."""
+        return PoseAhead(
+            self.camera_id,
+            self.packet.epoch,
+            self.packet.sequence,
+            self.capture_time_ns,
+            self.pose,
+            self.field_id,
+            self.quality,
+            self.clock,
+            self.localisation,
+            self.instant,
+        )
+
     def camera(self, intrinsics: Intrinsics) -> Camera | None:
         """Return the posed camera that took the picture; ``None`` if it is lost."""
         return None if self.pose is None else Camera(intrinsics, self.pose)
@@ -126,6 +142,54 @@ class Frame:
         if camera is None:
             return FieldView.nothing(intrinsics)
         return render_field_view(field, camera, self.quality)
+
+
+@dataclass(frozen=True)
+class PoseAhead:
+    """What is known of the next frame of a camera before it is coded: where it was taken, and how
+    the field is rendered there. Attributes are as of ``Frame``.
+
+    ``base_digest`` names the earlier frame that it can be predicted from; empty: none.
+    """
+
+    camera_id: str
+    epoch: int
+    sequence: int
+    capture_time_ns: int
+    pose: Pose | None
+    field_id: str = ""
+    quality: Quality = FULL
+    clock: ClockKind | None = None
+    localisation: LocalisationState | None = None
+    instant: int = 0
+    base_digest: bytes = b""
+
+    @property
+    def address(self) -> FrameAddress:
+        """Return camera, epoch and sequence of its frame."""
+        return FrameAddress(self.camera_id, self.epoch, self.sequence)
+
+    def frame(self, packet: DeltaPacket) -> Frame:
+        """Return the frame, now that it is coded."""
+        return Frame(
+            self.camera_id,
+            self.capture_time_ns,
+            self.pose,
+            self.field_id,
+            packet,
+            self.quality,
+            self.clock,
+            self.localisation,
+            self.instant,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PackedFrame:
+    """A frame, or a pose ahead of one, as ``rfcore.wire.head`` packs it."""
+
+    data: bytes
+    is_ahead: bool = False
 
 
 @dataclass(frozen=True)
@@ -197,5 +261,5 @@ class Credit:
     frames: int
 
 
-ClientMessage = Hello | Frame
+ClientMessage = Hello | PoseAhead | Frame
 ServerMessage = Welcome | Ack | Nack | FieldNotice | DrainNotice | StreetNotice | Credit

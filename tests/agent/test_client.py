@@ -76,7 +76,7 @@ class MemoryStream:
         if isinstance(message, Hello):
             self._reader = FrameReader(message)
         else:
-            message = self._reader.frame(message)
+            message = self._reader.read(message)
         self.received.append(message)
         answer = self._answer(message)
         if isinstance(answer, list):

@@ -73,7 +73,7 @@ def session(data: bytes) -> None:
             read = client_message_from_bytes(part)
             if isinstance(read, Hello):
                 reader = FrameReader(read)
-            machine.receive(read if isinstance(read, Hello) else reader.frame(read), float(now))
+            machine.receive(read if isinstance(read, Hello) else reader.read(read), float(now))
         except (InvalidInput, FrameRefused) as error:
             machine.refuse(error, float(now))
         for job in machine.jobs_to_start(float(now)):
@@ -142,9 +142,7 @@ def hello_and_frames() -> tuple[Hello, bytes, bytes]:
         for name in ("hello", "frame-0", "frame-1")
     )
     assert isinstance(hello, Hello)
-    assert isinstance(first, bytes)
-    assert isinstance(second, bytes)
-    return hello, first, second
+    return hello, first.data, second.data
 
 
 def packet(data: bytes) -> None:

@@ -114,7 +114,7 @@ class World:
             if isinstance(message, Hello):
                 self.reader = FrameReader(message)
             else:
-                message = self.reader.frame(message)
+                message = self.reader.read(message)
             self.server.receive(message, self.now)
         except (InvalidInput, FrameRefused) as error:
             self.server.refuse(error, self.now)

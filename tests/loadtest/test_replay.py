@@ -55,7 +55,7 @@ class ReadReplay(Replay):
 
     def frame_to_send(self, now: float) -> Frame | None:
         message = super().frame_to_send(now)
-        return message and self._reader.frame(client_message_from_bytes(message))
+        return message and self._reader.read(client_message_from_bytes(message))
 
 
 def replay_of(drive: PrerecordedDrive, seconds: float = 2.0, hz: float = 10.0) -> Replay:

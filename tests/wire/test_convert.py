@@ -23,6 +23,7 @@ from rfcore.wire.messages import (
     FrameAddress,
     Hello,
     Nack,
+    PackedFrame,
     ServerMessage,
     StageTimes,
     Welcome,
@@ -168,7 +169,9 @@ def test_arbitrary_bytes_from_a_vehicle_raise_our_errors_only(data: bytes) -> No
 
 def test_a_frame_comes_as_its_bytes():
     message = pb.StreamRequest(frame=b"head and payload").SerializeToString()
-    assert client_message_from_bytes(message) == b"head and payload"
+    assert client_message_from_bytes(message) == PackedFrame(b"head and payload")
+    message = pb.StreamRequest(pose_ahead=b"head").SerializeToString()
+    assert client_message_from_bytes(message) == PackedFrame(b"head", is_ahead=True)
 
 
 @given(data=st.binary(max_size=200))

@@ -259,6 +259,120 @@ def test_a_replayed_frame_is_the_same_frame_and_changes_nothing(hello, frame):
     ]
 
 
+# --- poses ahead
+
+
+def sent_ahead(hello, frames):
+    """Return the messages of frames, each after its pose; poses come before frames."""
+    writer, last, sent = FrameWriter(hello), None, []
+    for frame in frames:
+        message = writer.ahead(frame.ahead, last)
+        sent.append((pb.StreamRequest.FromString(message).pose_ahead, writer.data(frame, last)))
+        last = frame.address
+    return sent
+
+
+def test_frames_after_their_poses_are_the_same_and_the_poses_are_small(hello, frame):
+    frames = [replace(one, instant=3 + index) for index, one in enumerate(chain(frame))]
+    sent, reader = sent_ahead(hello, frames), FrameReader(hello)
+    for one, (ahead, data), whole in zip(frames, sent, written(hello, frames), strict=True):
+        said = reader.ahead(ahead)
+        assert replace(said, base_digest=b"") == one.ahead
+        assert said.base_digest == one.packet.base_digest
+        assert reader.frame(data) == one
+        assert len(data) + len(ahead) <= len(whole) + 5
+    assert max(len(ahead) for ahead, _ in sent[2:]) <= 16
+
+
+@pytest.mark.parametrize("change", [{"pose": posed(9)}, {"capture_time_ns": 5000}, {"instant": 9}])
+def test_a_frame_that_differs_from_its_pose_ahead_says_all_itself(hello, frame, change):
+    first, second = chain(frame, 2)
+    writer, reader = FrameWriter(hello), FrameReader(hello)
+    reader.frame(writer.data(first, None))
+    message = writer.ahead(replace(second.ahead, **change), first.address)
+    reader.ahead(pb.StreamRequest.FromString(message).pose_ahead)
+    sent = writer.data(second, first.address)
+    assert reader.frame(sent) == second
+    assert sent == written(hello, [first, second])[1]
+
+
+def test_a_frame_without_its_pose_ahead_is_refused_and_so_is_its_replay(hello, frame):
+    frames = chain(frame, 3)
+    sent, reader = sent_ahead(hello, frames), FrameReader(hello)
+    reader.ahead(sent[0][0])
+    reader.frame(sent[0][1])
+    for lost in (sent[1][1], sent[0][1]):
+        with pytest.raises(FrameRefused, match="sent ahead of it did not arrive") as caught:
+            reader.frame(lost)
+        assert caught.value.reason is RejectReason.UNKNOWN_STATE
+    assert caught.value.address.camera_id == "front"
+    reader.ahead(sent[1][0])
+    assert reader.frame(sent[1][1]) == frames[1]
+
+
+def test_a_pose_ahead_is_taken_once_and_none_after_its_frame(hello, frame):
+    frames = chain(frame, 3)
+    sent, reader = sent_ahead(hello, frames), FrameReader(hello)
+    reader.ahead(sent[0][0])
+    for again in range(2):
+        with pytest.raises(FrameRefused) as caught:
+            reader.ahead(sent[0][0])
+        assert caught.value.reason is RejectReason.STALE_SEQUENCE
+        if not again:
+            reader.frame(sent[0][1])
+
+
+def test_a_pose_ahead_whose_frame_never_comes_gives_way_to_the_next(hello, frame):
+    frames = chain(frame, 4)
+    writer, reader = FrameWriter(hello), FrameReader(hello)
+    reader.frame(writer.data(frames[0], None))
+    for one in frames[1:3]:
+        message = writer.ahead(one.ahead, frames[0].address)
+        reader.ahead(pb.StreamRequest.FromString(message).pose_ahead)
+    alone = replace(frames[2], packet=replace(frames[2].packet, references=(), base_digest=b""))
+    assert reader.frame(writer.data(alone, frames[0].address)) == alone
+
+
+def test_every_single_flip_of_a_pose_ahead_is_refused(hello, frame):
+    sent = sent_ahead(hello, chain(frame, 3))
+    ahead = sent[2][0]
+    for bit in range(8 * len(ahead)):
+        damaged = bytearray(ahead)
+        damaged[bit // 8] ^= 128 >> bit % 8
+        reader = FrameReader(hello)
+        for before in sent[:2]:
+            reader.ahead(before[0])
+            reader.frame(before[1])
+        with pytest.raises(FrameRefused):
+            reader.ahead(bytes(damaged))
+        with pytest.raises(FrameRefused):
+            reader.ahead(ahead[: bit // 8])
+        with pytest.raises(FrameRefused):
+            reader.ahead(ahead + b"\0")
+        assert reader.ahead(ahead).sequence == 43, "the damaged one left no trace"
+
+
+def test_every_single_flip_of_a_frame_after_its_pose_is_refused(hello, frame):
+    frames = chain(frame, 3)
+    sent = sent_ahead(hello, frames)
+    for bit in range(8 * len(sent[2][1])):
+        damaged = bytearray(sent[2][1])
+        damaged[bit // 8] ^= 128 >> bit % 8
+        reader = FrameReader(hello)
+        for ahead, data in sent[:2]:
+            reader.ahead(ahead)
+            reader.frame(data)
+        reader.ahead(sent[2][0])
+        with pytest.raises(FrameRefused):
+            reader.frame(bytes(damaged))
+        assert reader.frame(sent[2][1]) == frames[2], "the damaged one left no trace"
+
+
+def test_a_pose_ahead_of_a_frame_that_was_coded_is_refused(hello, frame):
+    with pytest.raises(FrameRefused, match=r"pose_ahead\.flags: 4"):
+        FrameReader(hello).ahead(forged(hello, frame))
+
+
 # --- refusals
 
 
@@ -314,7 +428,6 @@ def test_the_layout_is_the_documented_one(hello, frame):
     ("parts", "named"),
     [
         ({"camera": "00010"}, "frame.camera: 2 where Hello has 0..1"),
-        ({"anchor": "11"}, "frame.anchor: 3"),
         ({"epoch": number(1 << 32)}, "frame.epoch: 4294967296"),
         ({"sequence": number((1 << 63) - 1), "epoch": number(1 << 62)}, "frame.epoch"),
         ({"time": number(signed(-1))}, "frame.capture_time_ns"),

@@ -3,8 +3,8 @@
 isort:skip_file
 The stream between a vehicle and an edge server that hold the same radiance field.
 
-The vehicle says Hello, then sends Frames as far as the server's Credit goes; the server answers
-every Frame with exactly one Ack or Nack. A fatal error ends the stream with a gRPC status; what
+The vehicle says Hello, then sends Frames as far as the server's Credit goes, each with the pose
+ahead of it or without; the server answers every Frame with exactly one Ack or Nack. A fatal error ends the stream with a gRPC status; what
 concerns one frame is a Nack and the session lives on.
 
 Units are in the names. Times are nanoseconds of the Unix epoch. Poses are relative to the origin
@@ -165,9 +165,14 @@ class StreamRequest(_message.Message):
 
     HELLO_FIELD_NUMBER: _builtins.int
     FRAME_FIELD_NUMBER: _builtins.int
+    POSE_AHEAD_FIELD_NUMBER: _builtins.int
     frame: _builtins.bytes
     """One picture: a packed head and the slice. `rfcore.wire.head` (File formats: "Heads of
     frames") has the layout to the bit, what is implied, and what each check must catch.
+    """
+    pose_ahead: _builtins.bytes
+    """The first part of the next frame's head, sent before that frame is coded, so that the server
+    can render, warp and correct meanwhile. It is not answered.
     """
     @_builtins.property
     def hello(self) -> Global___Hello: ...
@@ -176,12 +181,13 @@ class StreamRequest(_message.Message):
         *,
         hello: Global___Hello | None = ...,
         frame: _builtins.bytes = ...,
+        pose_ahead: _builtins.bytes = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["frame", b"frame", "hello", b"hello", "message", b"message"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["frame", b"frame", "hello", b"hello", "message", b"message", "pose_ahead", b"pose_ahead"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["frame", b"frame", "hello", b"hello", "message", b"message"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["frame", b"frame", "hello", b"hello", "message", b"message", "pose_ahead", b"pose_ahead"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["hello", "frame"]  # noqa: Y015
+    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["hello", "frame", "pose_ahead"]  # noqa: Y015
     _WhichOneofArgType_message: _TypeAlias = _typing.Literal["message", b"message"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_message) -> _WhichOneofReturnType_message | None: ...
 

@@ -3,8 +3,8 @@
 isort:skip_file
 The stream between a vehicle and an edge server that hold the same radiance field.
 
-The vehicle says Hello, then sends Frames as far as the server's Credit goes; the server answers
-every Frame with exactly one Ack or Nack. A fatal error ends the stream with a gRPC status; what
+The vehicle says Hello, then sends Frames as far as the server's Credit goes, each with the pose
+ahead of it or without; the server answers every Frame with exactly one Ack or Nack. A fatal error ends the stream with a gRPC status; what
 concerns one frame is a Nack and the session lives on.
 
 Units are in the names. Times are nanoseconds of the Unix epoch. Poses are relative to the origin
