@@ -14,10 +14,13 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import itertools
 import math
+import os
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -30,6 +33,7 @@ from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
 from rfcore.field import FieldStore
 from rfcore.field.archive import PREFIX_BYTES, array_ends, header_end
 from rfcore.field.splat_archive import detail_ends
+from rfcore.files import open_alone
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 
@@ -141,8 +145,9 @@ class Beginnings:
         ends = self._ends or []
         there = [end for end in ends if end <= have_bytes]
         if there:
-            self._ends = ends[len(there) :]
+            self._ends = None
             await self._take(await asyncio.to_thread(_first_bytes, partial, there[-1]))
+            self._ends = ends[len(there) :]
 
 
 def _ends_of(partial: Path, have_bytes: int) -> list[int] | None:
@@ -172,18 +177,57 @@ async def fetch_field(
 ) -> None:
     """Put field ``field_id`` of the server into ``store``; what arrived before is not sent again.
 
-    The partial file lies in ``folder``; ``metadata`` goes with each call. Raises ``UnknownField``
+    The partial file lies in ``folder``; processes that share it have one each. If it was damaged
+    meanwhile, the field is fetched anew. ``metadata`` goes with each call. Raises ``UnknownField``
     when the server lacks the field, ``FieldFormatError`` when what arrives is not the field,
-    ``RfedgeError`` when it does not come, and what ``beginnings`` do.
+    ``RfedgeError`` when it does not come or cannot be kept, and what ``beginnings`` do.
     """
     stub = FieldServiceStub(channel)
-    partial = folder / f".{field_id}.part"
     size_bytes = await _size(stub, field_id, metadata)
     log.info("fetching field", field=field_id, size_bytes=size_bytes)
     pace = pace or FetchPace(1.0, lambda: False)
-    await Transfer(stub, field_id, partial, size_bytes, metadata, beginnings, pace).receive_all()
-    await asyncio.to_thread(_check_and_add, store, field_id, partial)
+    try:
+        with _partial_file(folder, field_id) as partial:
+            transfer = Transfer(stub, field_id, partial, size_bytes, metadata, beginnings, pace)
+            kept_bytes = partial.stat().st_size
+            try:
+                await _complete(transfer, store)
+            except FieldFormatError as error:
+                if not kept_bytes:
+                    raise
+                log.warning("fetching anew", kept_bytes=kept_bytes, problem=str(error))
+                await _complete(transfer, store)
+    except OSError as error:
+        raise RfedgeError(f"field {field_id} cannot be kept in {folder}: {error}") from error
     log.info("field fetched", field=field_id)
+
+
+@contextmanager
+def _partial_file(folder: Path, field_id: str) -> Iterator[Path]:
+    """Choose the first partial file that nobody else fetches to; one that is empty is removed."""
+    for number in itertools.count():
+        path = folder / (f".{field_id}.{number}.part" if number else f".{field_id}.part")
+        try:
+            file = open_alone(path)
+            break
+        except BlockingIOError:
+            continue
+    with file:
+        try:
+            yield path
+        finally:
+            if not path.stat().st_size:
+                path.unlink()
+
+
+async def _complete(transfer: Transfer, store: FieldStore) -> None:
+    """Receive the rest and add the field to the store; an archive that is damaged is emptied."""
+    try:
+        await transfer.receive_all()
+        await asyncio.to_thread(_check_and_add, store, transfer.field_id, transfer.partial)
+    except FieldFormatError:
+        os.truncate(transfer.partial, 0)
+        raise
 
 
 async def _size(stub: FieldServiceAsyncStub, field_id: str, metadata: Metadata) -> int:
@@ -264,14 +308,8 @@ class Transfer:
             )
 
     async def _use(self, have_bytes: int) -> None:
-        """Use what has arrived; remove it if it is damaged, so that no transfer resumes from it."""
-        if self.beginnings is None:
-            return
-        try:
+        if self.beginnings is not None:
             await self.beginnings.arrived(self.partial, have_bytes)
-        except FieldFormatError:
-            self.partial.unlink(missing_ok=True)
-            raise
 
 
 def _append(file: BinaryIO, chunk: bytes) -> None:
@@ -280,14 +318,12 @@ def _append(file: BinaryIO, chunk: bytes) -> None:
 
 
 def _check_and_add(store: FieldStore, field_id: str, partial: Path) -> None:
-    """Add the file to the store, or remove it: a wrong digest cannot be resumed from."""
-    try:
-        with partial.open("rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
-        if found != field_id:
-            raise FieldFormatError(
-                f"what the server sent as field {field_id} has sha256 {found}; it was removed"
-            )
-        store.add(partial, field_id)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Add the file to the store, and empty it."""
+    with partial.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != field_id:
+        raise FieldFormatError(
+            f"what the server sent as field {field_id} has sha256 {found}; it was removed"
+        )
+    store.add(partial, field_id)
+    os.truncate(partial, 0)

@@ -1,7 +1,8 @@
 """Files and folders that appear whole or not at all.
 
 The content goes to ``NAME.part`` beside the file, which is renamed over it at the end; when writing
-fails, the part is removed and what stood there before is untouched. A file is on the disk before it
+fails, the part is removed and what stood there before is untouched. Processes that write the same
+file take turns; a part that was left by one that was killed is written anew. A file is on the disk before it
 gets its name, and the name before the function returns, so that a power cut leaves the old file or
 the new one. A folder is not replaced: it must not exist before.
 
@@ -15,6 +16,7 @@ listed: its words may change, and the data stay the same.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -45,19 +47,43 @@ def is_regular(file: BinaryIO) -> bool:
     return stat.S_ISREG(os.fstat(file.fileno()).st_mode)
 
 
+def open_alone(path: Path) -> BinaryIO:
+    """Open a file for reading and writing as it is, new if it is missing, and lock it until it is
+    closed.
+
+    Raises ``BlockingIOError`` while another process or thread has it, and ``OSError``.
+    """
+    return _locked(path, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _locked(path: Path, operation: int) -> BinaryIO:
+    while True:
+        file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b")
+        try:
+            fcntl.flock(file, operation)
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
+        except BaseException:
+            file.close()
+            raise
+        file.close()  # whoever had it has renamed or removed it by now
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing that replaces ``path`` when the block ends. Raises ``OSError``."""
     partial = path.with_name(path.name + ".part")
-    try:
-        with partial.open("wb") as file:
+    with _locked(partial, fcntl.LOCK_EX) as file:
+        try:
+            file.truncate()
             yield file
             file.flush()
             os.fsync(file.fileno())
-        partial.replace(path)
-        _sync_folder(path.parent)
-    finally:
-        partial.unlink(missing_ok=True)
+            partial.replace(path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+    _sync_folder(path.parent)
 
 
 def _sync_folder(folder: Path) -> None:

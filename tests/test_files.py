@@ -1,6 +1,8 @@
 """A file appears whole or not at all."""
 
 import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -60,3 +62,30 @@ def test_a_folder_is_on_the_disk_with_all_it_holds_before_it_gets_its_name(tmp_p
         (folder / "b.txt").write_text("b")
     assert set(synced[:-2]) == {("inner", False), ("a.txt", False), ("b.txt", False)}
     assert synced[-2:] == [("out.part", False), (tmp_path.name, True)]
+
+
+def test_writers_of_one_file_take_turns(tmp_path):
+    path, begun, may_end = tmp_path / "a.bin", threading.Event(), threading.Event()
+
+    def slow() -> None:
+        with whole_file(path) as file:
+            file.write(b"first")
+            begun.set()
+            assert may_end.wait(10)
+
+    with ThreadPoolExecutor(2) as threads:
+        first = threads.submit(slow)
+        assert begun.wait(10)
+        second = threads.submit(write_whole, path, b"2nd")
+        may_end.set()
+        first.result(10)
+        second.result(10)
+    assert path.read_bytes() == b"2nd"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_part_that_was_left_is_written_anew(tmp_path):
+    (tmp_path / "a.bin.part").write_bytes(b"left by a process that was killed")
+    write_whole(tmp_path / "a.bin", b"new")
+    assert (tmp_path / "a.bin").read_bytes() == b"new"
+    assert len(list(tmp_path.iterdir())) == 1

@@ -1,18 +1,19 @@
 """A vehicle without the field gets it from the server, whole or not at all."""
 
 import asyncio
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, BinaryIO
 
 import grpc
 import pytest
 
 from cav_agent.field_fetch import Beginnings, fetch_field
 from mec_server.fields.service import read_chunk
-from rfcore.errors import FieldFormatError, UnknownField
+from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
 from rfcore.field import FieldStore
 from rfcore.field.archive import PREFIX_BYTES, array_ends, header_end
 from rfcore.field.splat_archive import detail_ends
@@ -63,11 +64,27 @@ async def test_an_interrupted_transfer_goes_on_where_it_stopped(
     assert FieldStore(tmp_path).path(street.field_id).read_bytes() == archive
 
 
-async def test_what_is_not_the_field_is_removed_and_the_next_try_succeeds(
+async def test_a_kept_part_that_was_damaged_is_fetched_anew(
     street: Any, serve: Any, tmp_path: Path
 ) -> None:
-    partial = tmp_path / f".{street.field_id}.part"
-    partial.write_bytes(b"garbage")
+    (tmp_path / f".{street.field_id}.part").write_bytes(b"garbage")
+    async with (
+        serve() as server,
+        grpc.aio.insecure_channel(str(server.address)) as channel,
+    ):
+        store = FieldStore(tmp_path)
+        await fetch_field(channel, store, street.field_id, tmp_path)
+    assert store.ids() == (street.field_id,)
+    assert [path.name for path in tmp_path.iterdir()] == [f"{street.field_id}.rff"]
+
+
+async def test_what_the_server_sends_is_refused_if_it_is_not_the_field(
+    street: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "mec_server.fields.service.read_chunk",
+        lambda path, offset_bytes: bytes(len(read_chunk(path, offset_bytes))),
+    )
     async with (
         serve() as server,
         grpc.aio.insecure_channel(str(server.address)) as channel,
@@ -75,7 +92,52 @@ async def test_what_is_not_the_field_is_removed_and_the_next_try_succeeds(
         store = FieldStore(tmp_path)
         with pytest.raises(FieldFormatError, match=r"has sha256 .*; it was removed"):
             await fetch_field(channel, store, street.field_id, tmp_path)
-        assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_two_vehicles_share_a_folder(
+    street: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each has a partial file of its own; the one that is left over is taken by the next fetch."""
+    archive = (street.store / "street.rff").read_bytes()
+    with sent_up_to(monkeypatch, len(archive) // 2) as may_go_on:
+        async with (
+            serve() as server,
+            grpc.aio.insecure_channel(str(server.address)) as channel,
+        ):
+            store = FieldStore(tmp_path)
+            fetches = [
+                asyncio.create_task(fetch_field(channel, store, street.field_id, tmp_path))
+                for _ in range(2)
+            ]
+            async with asyncio.timeout(30):
+                while len(parts := list(tmp_path.glob(".*.part"))) < 2 or not all(
+                    path.stat().st_size for path in parts
+                ):
+                    await asyncio.sleep(0.001)
+            may_go_on.set()
+            await asyncio.gather(*fetches)
+    assert [path.name for path in tmp_path.iterdir()] == [f"{street.field_id}.rff"]
+    assert store.path(street.field_id).read_bytes() == archive
+
+
+async def test_a_full_disk_is_named_and_what_came_before_is_kept(
+    street: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(file: BinaryIO, chunk: bytes) -> None:
+        file.write(chunk[:100])
+        file.flush()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    async with (
+        serve() as server,
+        grpc.aio.insecure_channel(str(server.address)) as channel,
+    ):
+        store = FieldStore(tmp_path)
+        with monkeypatch.context() as disk, pytest.raises(RfedgeError, match="No space left"):
+            disk.setattr("cav_agent.field_fetch._append", full)
+            await fetch_field(channel, store, street.field_id, tmp_path)
+        assert (tmp_path / f".{street.field_id}.part").stat().st_size == 100
         await fetch_field(channel, store, street.field_id, tmp_path)
     assert store.ids() == (street.field_id,)
 
@@ -194,9 +256,7 @@ async def test_beginnings_are_handed_over_once_each_and_again_after_a_broken_tra
     assert FieldStore(mine).path(field_id).read_bytes() == archive
 
 
-async def test_a_damaged_beginning_is_removed_and_named(
-    street: Any, serve: Any, tmp_path: Path
-) -> None:
+async def test_a_damaged_beginning_is_fetched_anew(street: Any, serve: Any, tmp_path: Path) -> None:
     archive = encode_field(street.field.compressed())
     field_id = FieldStore(tmp_path / "fields").add(archive)
     store = FieldStore(tmp_path / "mine")
@@ -212,8 +272,5 @@ async def test_a_damaged_beginning_is_removed_and_named(
         serve(fields=tmp_path / "fields") as server,
         grpc.aio.insecure_channel(str(server.address)) as channel,
     ):
-        with pytest.raises(FieldFormatError, match=f"{field_id}: array .* is damaged"):
-            await fetch_field(channel, store, field_id, tmp_path / "mine", (), Beginnings(take))
-        assert not partial.exists()
         await fetch_field(channel, store, field_id, tmp_path / "mine", (), Beginnings(take))
     assert store.ids() == (field_id,)
