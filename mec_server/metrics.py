@@ -202,6 +202,10 @@ class ServerMetrics:
             "rfedge_server_recording",
             "1 while pictures are recorded, 0 when none are asked for or the disk refused.",
         )
+        self.recording_dropped = make.counter(
+            "rfedge_server_recording_dropped_pictures",
+            "Pictures that were not recorded, since the disk was too slow.",
+        )
         self._tile_payload = make.counter(
             "rfedge_server_tile_payload_bytes",
             "Bytes of P slices that became pictures, by the tile of their field; empty: of none.",

@@ -3,14 +3,16 @@ FOLDER/<vehicle>/<camera>/<start>-<session>/.
 
 Each such part is a ``recording.jsonl`` and its pictures (``rfcore.dataset.recorded_session``). The
 first epoch's pictures are named by their sequence alone (000007.png); later ones have the epoch in
-front (e0003-000007.png), since sequences begin again. An error of the disk ends the recording for
-good, and never the streaming.
+front (e0003-000007.png), since sequences begin again. A disk that is too slow loses pictures of the
+recording, which are counted; an error of the disk ends the recording for good. Neither touches the
+streaming.
 
 Parts are deleted by age, and where there are too many bytes: then the tile that has most loses the
 oldest part of a vehicle that has more than a quarter of the tile's bytes, or else its oldest part.
 So one busy vehicle or tile evicts no other. ``start`` is when a part was begun, milliseconds of the
-Unix epoch. A part is closed early enough that whole parts can be deleted to keep both bounds; a
-part that is still written is deleted, too, when it must be.
+Unix epoch; a step of the clock while the server runs changes no age. A part is closed early enough
+that whole parts can be deleted to keep both bounds; a part that is still written is deleted, too,
+when it must be.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from rfcore.native.yuv import rgb_from_i420
 from rfcore.wire.messages import Frame, Hello
 
 MAX_WAITING = 32
-"""Pictures that may wait for the disk; beyond it decoding waits, and with it the vehicle."""
+"""Pictures that may wait for the disk; those beyond are not recorded."""
 TIDY_EVERY_S = 60.0
 """Period of checks for old parts while nothing is written."""
 PARTS = 16
@@ -66,13 +68,21 @@ class FieldTiles:
 
 
 def open_recorder(
-    settings: RecordSettings, tiles: FieldTiles, failed: Callable[[Exception], None]
+    settings: RecordSettings,
+    tiles: FieldTiles,
+    failed: Callable[[Exception], None],
+    dropped: Callable[[], None],
 ) -> Recorder | None:
     """Return the recorder that ``settings`` ask for, if they do; see ``Recorder``."""
     if settings.folder is None:
         return None
     limits = KeepLimits(round(settings.max_gb * 1e9), settings.max_age_h * 3600)
-    return Recorder(settings.folder, limits, tiles, lambda: time.time_ns() // 1_000_000, failed)
+    offset_ns = time.time_ns() - time.monotonic_ns()
+
+    def now_ms() -> int:
+        return (offset_ns + time.monotonic_ns()) // 1_000_000
+
+    return Recorder(settings.folder, limits, tiles, now_ms, failed, dropped)
 
 
 class RecordingQuota:
@@ -101,9 +111,13 @@ class RecordingQuota:
         return part
 
     def is_full(self, part: Path, now_ms: int) -> bool:
-        """Tell whether a part has its share of the bytes or of the time, or was deleted."""
+        """Tell whether a part has its share of the bytes or of the time, or was deleted, maybe by
+        somebody else."""
         size_bytes = self._bytes.get(part)
         if size_bytes is None or size_bytes >= self._limits.max_bytes / PARTS:
+            return True
+        if not part.is_dir():
+            self._forget(part)
             return True
         return now_ms - _start_ms(part) >= 1e3 * self._limits.max_age_s / PARTS
 
@@ -129,8 +143,16 @@ class RecordingQuota:
         return min(parts, key=_start_ms)
 
     def _delete(self, part: Path) -> None:
-        shutil.rmtree(part)
+        if part.is_dir():
+            shutil.rmtree(part)
+        self._forget(part)
+
+    def _forget(self, part: Path) -> None:
+        """Count a part no more that was deleted, and remove its vehicle's folders if empty."""
         del self._bytes[part], self._tiles[part]
+        for folder in (part.parent, part.parent.parent):
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
 
     def add(self, part: Path, written_bytes: int) -> None:
         """Count the bytes written to a part."""
@@ -157,9 +179,9 @@ class OpenPart:
 
 
 class Recorder:
-    """Writes pictures on a thread of its own; ``on_failure`` is called with the first error.
+    """Writes pictures on a thread of its own; ``on_failure`` is called with the first error, and
+    ``on_dropped`` for each picture that the disk was too slow for.
 
-    After any error the thread goes on emptying its queue, so that no worker waits for it for ever.
     ``now_ms``: the time of the Unix epoch.
     """
 
@@ -170,12 +192,14 @@ class Recorder:
         tiles: FieldTiles,
         now_ms: Callable[[], int],
         on_failure: Callable[[Exception], None],
+        on_dropped: Callable[[], None],
     ) -> None:
         self._root = root
         self._limits = limits
         self._tiles = tiles
         self._now_ms = now_ms
         self._on_failure = on_failure
+        self._on_dropped = on_dropped
         self._failed = False
         self._room: RecordingQuota | None = None
         self._open: dict[RecordedCamera, OpenPart] = {}
@@ -199,8 +223,12 @@ class Recorder:
         self._thread.join()
 
     def _put(self, waiting: QueuedPicture) -> None:
-        if not self._failed:
-            self._queue.put(waiting)
+        if self._failed:
+            return
+        try:
+            self._queue.put_nowait(waiting)
+        except queue.Full:
+            self._on_dropped()
 
     def _run(self) -> None:
         while True:
@@ -276,7 +304,7 @@ class SessionRecording:
         self._put = put
 
     def save(self, frame: Frame, field_id: str, picture: I420) -> None:
-        """Queue a picture; returns at once unless ``MAX_WAITING`` pictures wait for the disk."""
+        """Queue a picture; it is not recorded if ``MAX_WAITING`` others wait for the disk."""
         pose = frame.pose
         world_from_cam = None if pose is None else self._origins[field_id].globalise(pose)
         self._put(

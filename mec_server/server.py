@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import math
 import re
 import signal
 import socket
@@ -96,6 +97,9 @@ CONNECTIONS_EVERY_S = 0.05
 CONNECTIONS_REST = 20
 """Period of sweeps over all connections, and the least pause after one as a multiple of the time
 that it took."""
+
+DROPPED_AGAIN_S = 60.0
+"""Shortest time between two log lines about pictures that were not recorded."""
 
 DRAWN_S = 20.0
 """Time limit for the start of the threads that decode."""
@@ -201,7 +205,10 @@ class EdgeServer:
             lambda field_id: self._shelf.open(field_id).metadata.tile_origin,
             self._published.name_of,
         )
-        self._recorder = open_recorder(config.record, tiles, self._recording_failed)
+        self._recorder = open_recorder(
+            config.record, tiles, self._recording_failed, self._recording_dropped
+        )
+        self._dropped_told_s = -math.inf
         self._metrics.recording.set(self._recorder is not None)
         self._learner: Learner | None = None
         self._trials: UnrecordedTrials | None = None
@@ -505,6 +512,14 @@ class EdgeServer:
         if not isinstance(error, OSError):
             self._metrics.task_failed(BackgroundTask.RECORDING, error)
         log.error("recording stopped, streaming goes on", problem=str(error))
+
+    def _recording_dropped(self) -> None:
+        """Runs on the threads that decode."""
+        self._metrics.recording_dropped.inc()
+        now = time.monotonic()
+        if now - self._dropped_told_s >= DROPPED_AGAIN_S:
+            self._dropped_told_s = now
+            log.warning("the disk is too slow, pictures are not recorded")
 
     def _serve_metrics(self) -> None:
         settings = self._config.metrics

@@ -2,9 +2,9 @@
 
 The content goes to ``NAME.part`` beside the file, which is renamed over it at the end; when writing
 fails, the part is removed and what stood there before is untouched. Processes that write the same
-file take turns; a part that was left by one that was killed is written anew. A file is on the disk before it
-gets its name, and the name before the function returns, so that a power cut leaves the old file or
-the new one. A folder is not replaced: it must not exist before.
+file take turns; a part that was left by one that was killed is written anew. A file is on the disk
+before it gets its name, and the name before the function returns, so that a power cut leaves the
+old file or the new one. A folder is not replaced: it must not exist before.
 
 ``open_at_once`` opens what others put into folders, which may be no file but a pipe.
 

@@ -134,9 +134,10 @@ async def test_a_full_disk_is_named_and_what_came_before_is_kept(
         grpc.aio.insecure_channel(str(server.address)) as channel,
     ):
         store = FieldStore(tmp_path)
-        with monkeypatch.context() as disk, pytest.raises(RfedgeError, match="No space left"):
+        with monkeypatch.context() as disk:
             disk.setattr("cav_agent.field_fetch._append", full)
-            await fetch_field(channel, store, street.field_id, tmp_path)
+            with pytest.raises(RfedgeError, match="No space left"):
+                await fetch_field(channel, store, street.field_id, tmp_path)
         assert (tmp_path / f".{street.field_id}.part").stat().st_size == 100
         await fetch_field(channel, store, street.field_id, tmp_path)
     assert store.ids() == (street.field_id,)

@@ -1,6 +1,10 @@
 """Pictures are kept whole and in order, as datasets; a disk that refuses is reported once."""
 
 import errno
+import os
+import shutil
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +24,7 @@ from mec_server.recorder import (
 from recorded import recorded, recorded_parts
 from rfcore.camera import TileOrigin
 from rfcore.dataset import read_dataset
-from rfcore.image import I420
+from rfcore.image import I420, png_bytes
 from rfcore.wire.messages import Hello
 
 FIELD, EAST = "ab" * 32, "cd" * 32
@@ -50,6 +54,7 @@ class Folder:
 
     def __init__(self, path: Path, clock: Clock, hello: Hello, make_frame: Any) -> None:
         self.path = path
+        self.lost = 0
         self.make_frame = make_frame
         self._clock = clock
         self._hello = hello
@@ -63,7 +68,10 @@ class Folder:
         limits = KeepLimits(max_bytes, max_age_s)
         origins, names = {FIELD: ORIGIN, EAST: ORIGIN}, {FIELD: "west", EAST: "east", "": ""}
         tiles = FieldTiles(origins.__getitem__, names.__getitem__)
-        return Recorder(self.path, limits, tiles, self._clock, on_failure)
+        return Recorder(self.path, limits, tiles, self._clock, on_failure, self.dropped)
+
+    def dropped(self) -> None:
+        self.lost += 1
 
     def session(
         self, recorder: Recorder, session_id: str = "s1", **changes: Any
@@ -84,7 +92,15 @@ class Folder:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, clock: Clock, hello: Hello, make_frame: Any) -> Folder:
+def folder(
+    tmp_path: Path,
+    clock: Clock,
+    hello: Hello,
+    make_frame: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Folder:
+    monkeypatch.setattr(module, "MAX_WAITING", 1000)  # so that tests of what is kept lose nothing
+    monkeypatch.setattr(os, "fsync", lambda _: None)  # tests/test_files.py has the power cuts
     return Folder(tmp_path, clock, hello, make_frame)
 
 
@@ -235,6 +251,53 @@ def test_a_failure_stops_the_recording_once_and_blocks_no_worker(
     monkeypatch.setattr(module, name, broken)
     failures: list[Exception] = []
     recorder = folder.open(failures.append)
-    folder.save(folder.session(recorder), 2 * module.MAX_WAITING + 1)
+    folder.save(folder.session(recorder), 5)
     recorder.close()
     assert failures == [error]
+
+
+def test_a_slow_disk_loses_pictures_of_the_recording_and_holds_up_nobody(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, may_write = threading.Event(), threading.Event()
+
+    def slow(picture: np.ndarray[Any, Any]) -> bytes:
+        begun.set()
+        assert may_write.wait(10)
+        return png_bytes(picture)
+
+    monkeypatch.setattr(module, "png_bytes", slow)
+    monkeypatch.setattr(module, "MAX_WAITING", 4)
+    recorder = folder.open()
+    session = folder.session(recorder)
+    folder.save(session, 1)
+    assert begun.wait(10)
+    for sequence in range(1, 10):
+        session.save(folder.make_frame(sequence), FIELD, grey(50))
+    may_write.set()
+    recorder.close()
+    assert [picture.sequence for picture in recorded(folder.path)] == [0, 1, 2, 3, 4]
+    assert folder.lost == 5
+
+
+def test_a_part_that_somebody_removes_is_begun_anew(folder: Folder) -> None:
+    recorder = folder.open()
+    session = folder.session(recorder)
+    folder.save(session, 1)
+    while not recorded(folder.path):
+        time.sleep(0.001)
+    shutil.rmtree(folder.path / "cav-1")
+    session.save(folder.make_frame(7), FIELD, grey(50))
+    recorder.close()
+    assert [picture.sequence for picture in recorded(folder.path)] == [7]
+
+
+def test_a_vehicle_of_which_nothing_is_left_leaves_no_folder(folder: Folder, clock: Clock) -> None:
+    recorder = folder.open(max_age_s=1800.0)
+    folder.save(folder.session(recorder, vehicle_id="gone"), 1)
+    recorder.close()
+    clock.ms += 3_600_000
+    recorder = folder.open(max_age_s=1800.0)
+    folder.save(folder.session(recorder), 1)
+    recorder.close()
+    assert [path.name for path in folder.path.iterdir()] == ["cav-1"]
