@@ -37,6 +37,7 @@ from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import (
+    MAX_EPOCH_STEP,
     Ack,
     ClientMessage,
     Credit,
@@ -51,6 +52,9 @@ from rfcore.wire.messages import (
 )
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.values import MAX_PAYLOAD_BYTES
+
+MAX_PROBLEM = 500
+"""Letters of a server's problem that are kept; the rest could fill a disk with logs."""
 
 
 class LinkState(StrEnum):
@@ -196,7 +200,7 @@ class AgentSession:
     # --- messages from the server
 
     def receive(self, message: ServerMessage, now: float) -> None:
-        """Take one message of the server."""
+        """Take one message of the server; raise ``ProtocolError`` for an impossible one."""
         match message:
             case Welcome(session_id, exact, rate_hz):
                 self.state = LinkState.STREAMING
@@ -227,7 +231,12 @@ class AgentSession:
         if self.state is LinkState.GREETING:
             self.failed = ProtocolError(f"the server refused this vehicle's Hello: {nack.problem}")
             return
-        self._end_refused(nack, now)
+        epoch = max(camera.chain.epoch for camera in self._cameras.values())
+        if nack.current_epoch > epoch + MAX_EPOCH_STEP:
+            raise ProtocolError(
+                f"the server says epoch {nack.current_epoch}, and this vehicle is in {epoch}"
+            )
+        self._end_refused(replace(nack, problem=nack.problem[:MAX_PROBLEM]), now)
         camera_id = nack.address.camera_id
         if camera_id == "":
             for camera in self._cameras.values():

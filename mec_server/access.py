@@ -31,7 +31,7 @@ from datetime import datetime
 from pathlib import Path
 
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
-from rfcore.files import is_regular, open_at_once
+from rfcore.files import read_regular
 from rfcore.wire.tls import PeerIdentity, Role, parse_identity
 from rfcore.wire.values import check_name, shown
 
@@ -156,20 +156,9 @@ MAX_ACCESS_BYTES = 4 << 20
 def read_access(path: Path) -> AccessList:
     """Read an access file; raise ``InvalidInput`` naming the file and what is wrong in it."""
     try:
-        return _access_of(tomllib.loads(_text_of(path)))
-    except (OSError, ValueError, TypeError, AttributeError, RfedgeError) as error:
+        return _access_of(tomllib.loads(read_regular(path, MAX_ACCESS_BYTES).decode()))
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError, RfedgeError) as error:
         raise InvalidInput("access", f"{path}: {error}") from error
-
-
-def _text_of(path: Path) -> str:
-    """Return what a file holds, if it is one."""
-    with open_at_once(path) as file:
-        if not is_regular(file):
-            raise InvalidInput("access", "is no file, but a pipe, a folder or a device")
-        data = file.read(MAX_ACCESS_BYTES + 1)
-    if len(data) > MAX_ACCESS_BYTES:
-        raise InvalidInput("access", f"is longer than {MAX_ACCESS_BYTES} bytes")
-    return data.decode()
 
 
 def _access_of(table: dict[str, object]) -> AccessList:

@@ -14,14 +14,17 @@ from dataclasses import dataclass
 
 from rfcore.codec.packet import CheckedPacket, check_packet
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
-from rfcore.wire.messages import CameraDescription, Credit, Frame, FrameAddress, Hello
+from rfcore.wire.messages import (
+    MAX_EPOCH_STEP,
+    CameraDescription,
+    Credit,
+    Frame,
+    FrameAddress,
+    Hello,
+)
 
 MAX_GAP = 64
 """Sequences that may be missing at once; credits keep an honest sender far below it."""
-
-MAX_EPOCH_STEP = 1 << 16
-"""Largest step from one epoch to the next: a flipped high bit must not make all later ones
-stale."""
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from rfcore.errors import (
     RejectReason,
     RfedgeError,
     UnknownField,
+    named,
 )
 from rfcore.wire.head import FrameRefused
 from rfcore.wire.messages import (
@@ -413,5 +414,5 @@ def _ns(seconds: float) -> int:
 
 
 def _unknown_field(asked: str, held: Sequence[str]) -> UnknownField:
-    here = ", ".join(held) or "no field"
+    here = named(held, "no field")
     return UnknownField(f"the vehicle asked for field {asked}; this server holds {here}")

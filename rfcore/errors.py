@@ -21,8 +21,23 @@ A message names the offending value, the limit it broke and what to do about it.
 it as one line and exit with status 2; services map it to one gRPC status (``rfcore.wire``).
 """
 
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import Any
+
+MOST_NAMED = 8
+
+
+def named(names: Iterable[str], none: str) -> str:
+    """Return the first of many names for a message, and how many more there are; or ``none``.
+
+    >>> named((f"f{n}" for n in range(10)), "nothing")
+    'f0, f1, f2, f3, f4, f5, f6, f7 and 2 more'
+    """
+    all_names = list(names)
+    more = len(all_names) - MOST_NAMED
+    first = ", ".join(all_names[:MOST_NAMED]) or none
+    return f"{first} and {more} more" if more > 0 else first
 
 
 class RfedgeError(Exception):

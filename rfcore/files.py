@@ -28,7 +28,7 @@ from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.errors import DatasetError, InvalidData, InvalidInput
 
 DECODED_BYTES = 2 << 30
 """Default limit of the memory for a file's decoded content: 9 million splats of SH degree 3."""
@@ -40,6 +40,21 @@ def open_at_once(path: Path) -> BufferedReader:
     Raises ``OSError``.
     """
     return os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+
+
+def read_regular(path: Path, max_bytes: int) -> bytes:
+    """Return a file's bytes; whoever names it may not be trusted.
+
+    Raises ``InvalidData`` for a pipe, folder or device, and for more than ``max_bytes``, and
+    ``OSError``.
+    """
+    with open_at_once(path) as file:
+        if not is_regular(file):
+            raise InvalidData("is no file, but a pipe, a folder or a device")
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise InvalidData(f"more than {max_bytes} bytes; split it")
+    return data
 
 
 def is_regular(file: BinaryIO) -> bool:

@@ -18,7 +18,7 @@ from types import MappingProxyType
 
 import structlog
 
-from rfcore.errors import RfedgeError, UnknownField
+from rfcore.errors import RfedgeError, UnknownField, named
 from rfcore.field import RadianceField
 from rfcore.field.folder import FIELD_ID, SUFFIX, FieldFolder, FolderListing
 from rfcore.field.own import OwnField
@@ -68,7 +68,7 @@ class FieldIndex:
             name = self.own[field_id].name
             raise UnknownField(f"field {field_id!r} is code and has no file: run {name} yourself")
         if path is None:
-            here = ", ".join(self._ids) or "nothing"
+            here = named(self._ids, "nothing")
             raise UnknownField(f"field {field_id!r} is not on this server; it holds {here}")
         return path
 

@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeVar
 
 import grpc
 import numpy as np
+import structlog
 
 from mec_server.ledger.budgets import Limit
 from mec_server.ledger.ledger import HELD_RETRY_S
@@ -30,6 +31,8 @@ from rfcore.wire.tiles import LearntLight, Tile, learnt_message, tile_message
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1 import field_pb2_grpc
 from rfcore.wire.values import check_field_id
+
+log = structlog.get_logger()
 
 CHUNK_BYTES = 64 * 1024
 """Size of what is read at once, the same as a connection's window: the memory that a peer which
@@ -98,12 +101,20 @@ class FieldShelf:
     def warm_up(self) -> int:
         """Open fields in advance, so that the first vehicle waits for none; return how many.
 
-        Fields that are open already (the published ones) are taken to be all that is needed.
+        Fields that are open already (the published ones) are taken to be all that is needed. One
+        that cannot be opened is logged; if none can, raises what the first one raised.
         """
         ids = list(self._open or self._store.ids())[:MAX_OPEN_FIELDS]
+        failed: list[RfedgeError] = []
         for field_id in ids:
-            self.open(field_id)
-        return len(ids)
+            try:
+                self.open(field_id)
+            except RfedgeError as error:
+                log.error("field cannot be opened", field=field_id, problem=str(error))
+                failed.append(error)
+        if failed and len(failed) == len(ids):
+            raise failed[0]
+        return len(ids) - len(failed)
 
 
 def _from_the_middle(bounds: Bounds) -> Camera:

@@ -29,7 +29,7 @@ from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
 from mec_server.twin.state import Covers, ReceivedPicture, Twin
 from rfcore.camera import Camera, TileOrigin
-from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded
+from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, named
 from rfcore.field import RadianceField
 from rfcore.field.quality import FULL
 from rfcore.image import Rgb
@@ -105,7 +105,7 @@ def viewed_tile(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) ->
             return ViewedTile(request.field_id or tile.field_id, tile.archive_ids)
     if request.field_id:
         return ViewedTile(request.field_id, frozenset((request.field_id,)))
-    here = ", ".join(tile.name for tile in tiles) or "none; name a field_id"
+    here = named((tile.name for tile in tiles), "none; name a field_id")
     raise InvalidInput("tile", f"{shown(request.tile)} is not published here; published: {here}")
 
 
@@ -114,7 +114,7 @@ def _tile_at(place: TileOrigin, tiles: Sequence[Tile]) -> Tile:
     at = (place.east_m, place.north_m)
     reaching = [tile for tile in tiles if tile.reaches(*at)]
     if not reaching:
-        here = ", ".join(map(_area_of, tiles)) or "none; name a field_id"
+        here = named(map(_area_of, tiles), "none; name a field_id")
         raise InvalidInput(
             "place",
             f"east {at[0]:.10g} m, north {at[1]:.10g} m is on no tile published here: {here}",

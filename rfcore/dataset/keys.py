@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from rfcore.camera import Pose
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.errors import DatasetError, InvalidData, InvalidInput
+from rfcore.files import read_regular
 from rfcore.geodesy import Anchor, anchor_of_values
 from rfcore.lens import BrownLens, FisheyeLens, Lens
 from rfcore.tables import Table
@@ -39,28 +40,27 @@ def blamed_on(where: object) -> Iterator[None]:
         raise DatasetError(f"{where}: {error}") from error
 
 
-def read_file(file: Path) -> bytes:
+MAX_TEXT_BYTES = 1 << 27
+"""200,000 pictures at 600 bytes each; parsed, JSON takes some ten times its size."""
+
+MAX_BINARY_BYTES = 1 << 32
+"""COLMAP's tables of 10,000 pictures with all their points take a tenth."""
+
+
+def read_file(file: Path, max_bytes: int = MAX_BINARY_BYTES) -> bytes:
     """Return a file's bytes; raise ``DatasetError`` naming it."""
     try:
-        return file.read_bytes()
+        return read_regular(file, max_bytes)
+    except InvalidData as error:
+        raise DatasetError(f"{file}: {error}") from error
     except OSError as error:
         raise DatasetError(f"{file}: cannot be read ({error.strerror})") from error
-
-
-MAX_JSON_BYTES = 1 << 27
-"""200,000 pictures at 600 bytes each; parsed, JSON takes some ten times its size."""
 
 
 def load_json(file: Path) -> Any:
     """Return the content of a JSON file; raise ``DatasetError`` naming it."""
     try:
-        size_bytes = file.stat().st_size
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from error
-    if size_bytes > MAX_JSON_BYTES:
-        raise DatasetError(f"{file}: {size_bytes} bytes, more than {MAX_JSON_BYTES}; split it")
-    try:
-        return json.loads(read_file(file))
+        return json.loads(read_file(file, MAX_TEXT_BYTES))
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{file}: not JSON ({error})") from error
 
@@ -68,8 +68,8 @@ def load_json(file: Path) -> Any:
 def load_toml(file: Path) -> dict[str, Any]:
     """Return the content of a TOML file; raise ``DatasetError`` naming it."""
     try:
-        return tomllib.loads(read_file(file).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(read_file(file, MAX_TEXT_BYTES).decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DatasetError(f"{file}: not TOML ({error})") from error
 
 

@@ -52,6 +52,8 @@ from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, joined
 
 ENCODING = "delta-1"
 ADDED = "added."
+ADDED_MEANS = f"{ADDED}means"
+"""Never left out: its bytes bound how many splats may be claimed."""
 SMALLEST_BAND = 2
 """Steps by which a number of the higher bands of colours must differ to be stored."""
 OF_BASE = tuple(f.name for f in fields(SplatNumbers) if f.name != "blocks")
@@ -87,7 +89,11 @@ def _archive(base_id: str, grid: GridSplats, version: SplatField) -> Archive:
     for detail, level in version.levels.items():
         own = level_numbers_of(level, whole, grid.steps)
         parts[level_name(detail)] = own - _expected_level(grid, detail, len(own))
-    coded = {name: encode_columns(part) for name, part in parts.items() if part.any()}
+    coded = {
+        name: encode_columns(part)
+        for name, part in parts.items()
+        if part.any() or (name == ADDED_MEANS and part.size)
+    }
     encoding = {
         "name": ENCODING,
         "count": len(gaussians),
@@ -166,6 +172,8 @@ class _Stored:
             raise InvalidInput(
                 "encoding", f"arrays {', '.join(archive.arrays)} are not its streams"
             )
+        if count > n and ADDED_MEANS not in streams:
+            raise InvalidInput("encoding.streams", f"lack {ADDED_MEANS} of {count - n} splats")
         return cls(archive, streams, shapes, levels)
 
     def part(self, name: str) -> Integers:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rfcore.errors import FieldFormatError, InvalidInput, UnknownField
+from rfcore.errors import FieldFormatError, InvalidInput, UnknownField, named
 from rfcore.field.archive import Archive, decode_archive, encode_archive, read_file
 from rfcore.field.delta import delta_field
 from rfcore.field.folder import FIELD_ID, SUFFIX, FieldFolder
@@ -264,7 +264,7 @@ class FieldStore:
         """Return the file of a field; raise ``UnknownField`` listing the fields that exist."""
         files = self._files()
         if field_id not in files:
-            here = ", ".join(sorted(files)) or "nothing"
+            here = named(sorted(files), "nothing")
             raise UnknownField(f"field {field_id!r} is not in {self._directory}; it holds {here}")
         return files[field_id]
 

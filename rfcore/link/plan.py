@@ -376,7 +376,7 @@ def read_link(path: Path) -> LinkPlan:
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidData(f"{path}: not a link profile ({error})") from error
     try:
         return _link(Table(values, InvalidInput), path.parent)

@@ -20,6 +20,10 @@ from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.values import ClockKind
 
+MAX_EPOCH_STEP = 1 << 16
+"""Largest step from one epoch to the next: a flipped high bit must not make all later ones
+stale."""
+
 
 @dataclass(frozen=True)
 class FrameAddress:

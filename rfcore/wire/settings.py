@@ -45,7 +45,7 @@ def words_of_command_line(words: Sequence[str]) -> list[str]:
         return list(words)
     try:
         options = tomllib.loads(Path(name).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InvalidInput("config", f"{name} cannot be read: {error}") from error
     words_of_file = []
     for key, value in options.items():

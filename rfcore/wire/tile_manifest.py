@@ -20,16 +20,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rfcore.errors import FieldFormatError, InvalidInput, UnknownField
+from rfcore.errors import FieldFormatError, InvalidData, InvalidInput, UnknownField
 from rfcore.field import FieldStore
 from rfcore.field.archive import decode_archive, read_file
 from rfcore.field.interface import base_of
-from rfcore.files import write_whole
+from rfcore.files import read_regular, write_whole
 from rfcore.wire.tiles import MAX_TILES, Area, Tile, TileLight
 from rfcore.wire.values import check_field_id, check_name
 
 MANIFEST = "tiles.json"
 FORMAT = "rfedge tiles 1"
+MAX_MANIFEST_BYTES = 16 << 20
 
 
 @dataclass(frozen=True)
@@ -157,11 +158,11 @@ def read_publication(folder: Path) -> Publication:
     if not path.exists():
         return Publication({})
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_regular(path, MAX_MANIFEST_BYTES))
         if content["format"] != FORMAT:
             raise FieldFormatError(f"{path}: format {content['format']!r} is not {FORMAT!r}")
         return Publication({name: _versions(tile) for name, tile in content["tiles"].items()})
-    except (ValueError, KeyError, TypeError, AttributeError, InvalidInput) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, InvalidData) as error:
         raise FieldFormatError(f"{path}: {type(error).__name__} {error}") from error
 
 

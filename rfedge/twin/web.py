@@ -285,7 +285,11 @@ def wish(text: str) -> Select | Look | ShowObjects:
     ``look`` null, or the ``field`` and a camera relative to its tile: ``translation_m``,
     ``rotation_wxyz``, and ``intrinsics`` by the names of ``Intrinsics``.
     """
-    match json.loads(text):
+    try:
+        message = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("a message is nested too deep") from error
+    match message:
         case {"select": None, **rest} if not rest:
             return Select(None)
         case {"select": [str(vehicle), str(camera)], **rest} if not rest:

@@ -15,9 +15,10 @@ from cav_agent.frames import (
     StreamEnd,
 )
 from cav_agent.session import AgentSession, LinkState, OutgoingMessage
-from rfcore.errors import InvalidInput, RejectReason, RfedgeError
+from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.messages import (
+    MAX_EPOCH_STEP,
     Ack,
     Credit,
     FieldNotice,
@@ -227,6 +228,18 @@ def test_after_a_nack_the_next_packet_begins_a_new_epoch(sender: Sender) -> None
 def test_a_server_in_a_later_epoch_is_overtaken(sender: Sender) -> None:
     sender.nacked(sender.send(), RejectReason.STALE_EPOCH, current_epoch=700)
     assert sender.send().packet.epoch == 701
+
+
+@pytest.mark.parametrize("epoch", [2**32 - 1, 2**32 - 2, MAX_EPOCH_STEP + 1])
+def test_an_epoch_that_no_server_can_have_ends_the_stream(sender: Sender, epoch: int) -> None:
+    with pytest.raises(ProtocolError, match=f"epoch {epoch}, and this vehicle is in 0"):
+        sender.nacked(sender.send(), RejectReason.STALE_EPOCH, current_epoch=epoch)
+
+
+def test_a_problem_of_any_length_is_cut(sender: Sender) -> None:
+    nack = Nack(sender.send().address, RejectReason.CRC_MISMATCH, "x" * 900_000)
+    sender.session.receive(nack, 2.0)
+    assert len(sender.session.take_results()[0].problem) < 1000
 
 
 def test_a_nack_of_a_gap_covers_all_its_sequences(sender: Sender) -> None:

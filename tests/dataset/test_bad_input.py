@@ -6,6 +6,7 @@ damaged behind its header is found when its pixels are.
 
 import json
 import math
+import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -300,9 +301,22 @@ def test_a_picture_outside_the_trajectory_is_left_out_when_that_is_declared(gold
     assert dataset.sorted_out == 1
 
 
-def test_a_transforms_file_beyond_the_budget_is_refused_unread(tmp_path, monkeypatch):
+def test_a_transforms_file_beyond_the_budget_is_refused(tmp_path, monkeypatch):
     (tmp_path / "transforms.json").write_text('{"frames": []}')
-    monkeypatch.setattr("rfcore.dataset.keys.MAX_JSON_BYTES", 13)
-    monkeypatch.setattr("rfcore.dataset.keys.read_file", None)  # none is to get so far
-    with pytest.raises(DatasetError, match=r"transforms\.json: 14 bytes, more than 13; split it"):
+    monkeypatch.setattr("rfcore.dataset.keys.MAX_TEXT_BYTES", 13)
+    with pytest.raises(DatasetError, match=r"transforms\.json: more than 13 bytes; split it"):
+        read_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "camera.toml", "recording.jsonl"])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(DatasetError, match=f"{name}: is no file, but a pipe"):
+        read_dataset(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "camera.toml"])
+def test_values_that_are_nested_too_deep_are_refused(tmp_path, name):
+    (tmp_path / name).write_text("a = " * name.endswith("toml") + "[" * 3000 + "]" * 3000)
+    with pytest.raises(DatasetError, match=f"{name}: not "):
         read_dataset(tmp_path)

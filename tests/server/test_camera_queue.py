@@ -7,14 +7,13 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mec_server.camera_queue import (
-    MAX_EPOCH_STEP,
     MAX_GAP,
     CameraQueue,
     SequenceGap,
     SessionCameras,
 )
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
-from rfcore.wire.messages import Credit, Frame, FrameAddress, Hello
+from rfcore.wire.messages import MAX_EPOCH_STEP, Credit, Frame, FrameAddress, Hello
 
 MakeFrame = Callable[..., Frame]
 WINDOW = 2

@@ -8,7 +8,7 @@ import pytest
 
 from mec_server.fields.service import FieldShelf
 from rfcore.camera import Camera
-from rfcore.errors import InvalidInput
+from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field import Bounds, FieldMetadata
 from rfcore.field.interface import NGP, SPLATS
 from rfcore.field.quality import FULL, Quality
@@ -55,6 +55,21 @@ def warm_shelf(**fields: DrawnField) -> FieldShelf:
     shelf = FieldShelf(Fields(fields), fields.__getitem__)  # type: ignore[arg-type]
     assert shelf.warm_up() == len(fields)
     return shelf
+
+
+def test_a_field_that_cannot_be_opened_harms_no_other() -> None:
+    fields = Fields(good=DrawnField(100), bad=DrawnField(100))
+
+    def load(field_id: str) -> DrawnField:
+        if field_id == "bad":
+            raise FieldFormatError("bad: damaged")
+        return fields[field_id]
+
+    shelf = FieldShelf(fields, load)  # type: ignore[arg-type]
+    assert shelf.warm_up() == 1
+    del fields["good"]
+    with pytest.raises(FieldFormatError, match="bad: damaged"):
+        FieldShelf(fields, load).warm_up()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
