@@ -1,7 +1,9 @@
 """Parses a line of JSON per pose: gpsd's reports, or a schema of our own for everything else.
 
 gpsd (https://gpsd.gitlab.io/gpsd/gpsd_json.html): ``TPV`` gives the position, ``ATT`` the heading
-of a compass or of two antennas; other classes are ignored. Its error estimates count as 95 %.
+of a compass or of two antennas (without a time, as from HDT, it is that of the next position), and
+``GST`` the standard deviations; other classes are ignored. Without GST an RTK solution has those of
+its kind, for gpsd's own estimates leave RTK out; other estimates count as 95 %.
 
 Our own schema, one object a line, keys with units; what is not named here is refused:
 
@@ -30,6 +32,9 @@ KEYS = {
     "heading_deg", "quaternion", "covariance_m2", "rotation_std_deg",
 }  # fmt: skip
 TWO_SIDED_95 = 1.96
+RTK_STD_M = {3: 0.03, 4: 0.3}
+"""Standard deviation by TPV's status: RTK fixed and float."""
+LEAST_STD_M = 0.01
 UNKNOWN_STD_M = 3.0
 UNKNOWN_HEIGHT_STD_M = 50.0
 COURSE_STD_DEG, COMPASS_STD_DEG = 3.0, 2.0
@@ -45,6 +50,8 @@ class JsonParser:
 
     def __init__(self) -> None:
         self._attitude: tuple[int, float] | None = None
+        self._heading_of_next: float | None = None
+        self._std_m: tuple[int, Vec3] | None = None
 
     def receive(self, line: str) -> Fix | None:
         """Return the fix of a line, None for one that holds none; raise ``BadReading``."""
@@ -57,9 +64,18 @@ class JsonParser:
         return self._report(values) if "class" in values else _own(values)
 
     def _report(self, values: Mapping[str, Any]) -> Fix | None:
-        if values["class"] == "ATT" and "heading" in values and "time" in values:
+        if values["class"] == "ATT" and "heading" in values:
             heading_deg = finite("heading", values["heading"], 0, 360)
-            self._attitude = (_time_ns(values), heading_deg)
+            if "time" in values:
+                self._attitude = (_time_ns(values), heading_deg)
+            else:
+                self._heading_of_next = heading_deg
+        if values["class"] == "GST" and {"time", "lon", "lat", "alt"} <= set(values):
+            east, north, up = (
+                max(finite("GST", values[key], 0, 1e5), LEAST_STD_M)
+                for key in ("lon", "lat", "alt")
+            )
+            self._std_m = (_time_ns(values), (east, north, up))
         if values["class"] != "TPV":
             return None
         if finite("mode", values.get("mode", 0), 0, 3) < 2 or "lat" not in values:
@@ -73,12 +89,21 @@ class JsonParser:
             time_ns=time_ns,
             geodetic=(*_place(values, "lat", "lon"), height_m),
             xyz_m=None,
-            position_std_m=_stated_errors(values, height_m is not None),
+            position_std_m=self._errors(values, time_ns, height_m is not None),
             heading_deg=course_deg,
             rotation_std_deg=std_deg,
         )
 
+    def _errors(self, values: Mapping[str, Any], time_ns: int, has_height: bool) -> Vec3:
+        std_m = _stated_errors(values)
+        if self._std_m is not None and abs(time_ns - self._std_m[0]) <= FRESH_S * 1e9:
+            std_m = self._std_m[1]
+        return std_m if has_height else (*std_m[:2], UNKNOWN_HEIGHT_STD_M)
+
     def _heading(self, values: Mapping[str, Any], time_ns: int) -> tuple[float | None, float]:
+        heading_deg, self._heading_of_next = self._heading_of_next, None
+        if heading_deg is not None:
+            return heading_deg, COMPASS_STD_DEG
         if self._attitude is not None and abs(time_ns - self._attitude[0]) <= FRESH_S * 1e9:
             return self._attitude[1], COMPASS_STD_DEG
         if "track" in values and finite("speed", values.get("speed", 0), 0, 500) > LEAST_SPEED_MPS:
@@ -138,14 +163,19 @@ def _place(values: Mapping[str, Any], latitude: str, longitude: str) -> tuple[fl
     )
 
 
-def _stated_errors(values: Mapping[str, Any], has_height: bool) -> Vec3:
-    """Return standard deviations east, north, up of gpsd's error estimates."""
-    up_m = UNKNOWN_STD_M if has_height else UNKNOWN_HEIGHT_STD_M
-    found = []
-    for key, default_m in (("epx", UNKNOWN_STD_M), ("epy", UNKNOWN_STD_M), ("epv", up_m)):
-        given = finite(key, values[key], 0, 1e5) / TWO_SIDED_95 if key in values else default_m
-        found.append(max(given, 0.01))
-    return (found[0], found[1], found[2] if has_height else UNKNOWN_HEIGHT_STD_M)
+def _stated_errors(values: Mapping[str, Any]) -> Vec3:
+    """Return standard deviations east, north, up of a TPV's status or error estimates."""
+    rtk_m = RTK_STD_M.get(int(finite("status", values.get("status", 0), 0, 100)))
+    if rtk_m is not None:
+        return (rtk_m, rtk_m, 1.5 * rtk_m)
+
+    def stated(*keys: str) -> float:
+        for key in keys:
+            if key in values:
+                return max(finite(key, values[key], 0, 1e5) / TWO_SIDED_95, LEAST_STD_M)
+        return UNKNOWN_STD_M
+
+    return (stated("epx", "eph"), stated("epy", "eph"), stated("epv"))
 
 
 def _standard_deviations(covariance: object) -> Vec3:

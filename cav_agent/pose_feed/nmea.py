@@ -1,9 +1,10 @@
 """Parses NMEA 0183 sentences of a GNSS receiver into fixes, by the library ``pynmea2``.
 
 A receiver sends several sentences an epoch. GGA gives position, height and quality; RMC the date,
-and the position where no GGA came until the second RMC; HDT the heading of two antennas; VTG and
-RMC the course over ground, which is the heading of a vehicle that drives; GST the standard
-deviations, of the epoch before where it follows GGA. One fix an epoch is made.
+and the position where no GGA came until the second RMC; HDT and THS the heading of two antennas;
+VTG and RMC the course over ground, which is the heading of a vehicle that drives; GST the standard
+deviations, of the epoch before where it follows GGA. One fix an epoch is made. GGA's altitude is
+above the geoid: without the geoid's separation the fix has no height. Other sentences are ignored.
 A state machine: lines go in, fixes come out; ``now_ns`` only gives the day before the first RMC.
 """
 
@@ -67,6 +68,9 @@ class NmeaParser:
             message = self._library.parse(sentence, check=True)
             taker = self._takers.get(getattr(message, "sentence_type", ""))
             return None if taker is None else taker(message, now_ns)
+        except self._library.SentenceTypeError:
+            self._ths(sentence)
+            return None
         except self._library.ChecksumError as error:
             raise BadReading(FeedProblem.CHECKSUM, f"{sentence[:80]!r}") from error
         except BadReading:
@@ -80,8 +84,8 @@ class NmeaParser:
             raise BadReading(FeedProblem.NO_FIX, "the receiver has no position")
         self._has_gga = True
         height_m = None
-        if _is_given(message.altitude):
-            separation_m = finite("GGA geoid", message.geo_sep or 0.0, -200, 200)
+        if _is_given(message.altitude) and _is_given(message.geo_sep):
+            separation_m = finite("GGA geoid", message.geo_sep, -200, 200)
             height_m = finite("GGA altitude", message.altitude, -1000, 10_000) + separation_m
         spread_m = SPREAD_M.get(quality, SPREAD_M[1])
         if _is_given(message.horizontal_dil):
@@ -100,7 +104,7 @@ class NmeaParser:
         if self._has_gga or self._rmc_alone == 1:  # a GGA with the height may follow
             return None
         spread_m = SPREAD_M[1]
-        return self._fix(message, None, (spread_m, spread_m, UNKNOWN_HEIGHT_STD_M), now_ns)
+        return self._fix(message, None, (spread_m, spread_m, spread_m), now_ns)
 
     def _vtg(self, message: Any, now_ns: int) -> None:  # noqa: ARG002
         if _is_given(message.true_track) and _is_given(message.spd_over_grnd_kmph):
@@ -109,8 +113,17 @@ class NmeaParser:
 
     def _hdt(self, message: Any, now_ns: int) -> None:  # noqa: ARG002
         if _is_given(message.heading):
-            heading_deg = finite("HDT heading", message.heading, 0, 360)
-            self._course = Course(heading_deg, HDT_STD_DEG, self._sentences)
+            self._take_heading("HDT", message.heading)
+
+    def _ths(self, sentence: str) -> None:
+        """Take a THS, which the library does not know; its checksum was right."""
+        name, *values = sentence.strip().lstrip("$").partition("*")[0].split(",")
+        if name[2:] == "THS" and len(values) == 2 and values[0] and values[1] != "V":
+            self._take_heading("THS", values[0])
+
+    def _take_heading(self, kind: str, value: Any) -> None:
+        heading_deg = finite(f"{kind} heading", value, 0, 360)
+        self._course = Course(heading_deg, HDT_STD_DEG, self._sentences)
 
     def _gst(self, message: Any, now_ns: int) -> None:  # noqa: ARG002
         names = ("std_dev_longitude", "std_dev_latitude", "std_dev_altitude")
@@ -148,11 +161,14 @@ class NmeaParser:
         course = self._course
         if course is not None and not self._is_recent(course):
             course = self._course = None
+        std_m = self._std_m or std_m
+        if height_m is None:
+            std_m = (*std_m[:2], UNKNOWN_HEIGHT_STD_M)
         return Fix(
             time_ns=time_ns,
             geodetic=(latitude_deg, longitude_deg, height_m),
             xyz_m=None,
-            position_std_m=self._std_m or std_m,
+            position_std_m=std_m,
             heading_deg=None if course is None else course.heading_deg,
             rotation_std_deg=COURSE_STD_DEG if course is None else course.std_deg,
         )

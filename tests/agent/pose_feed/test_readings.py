@@ -68,6 +68,27 @@ def test_two_antennas_go_before_the_course_and_gst_before_the_table():
     assert fix.position_std_m == (0.5, 0.9, 0.8)
 
 
+def test_a_gga_without_the_geoids_separation_has_no_height():
+    parser = NmeaParser()
+    parser.receive(nmea("GPGST,221321.000,15.5,15.3,7.2,21.8,0.9,0.5,0.8"), NOON_NS)
+    without = "GPGGA,221321.500,4807.038,N,01131.000,E,4,08,0.9,545.4,M,,M,,"
+    fix = parser.receive(nmea(without), NOON_NS)
+    assert fix.geodetic[2] is None
+    assert fix.position_std_m == (0.5, 0.9, 50.0)
+
+
+@pytest.mark.parametrize(("mode", "heading_deg"), [("A", 77.5), ("V", None)])
+def test_the_heading_of_ths_is_taken_if_it_is_valid(mode, heading_deg):
+    parser = NmeaParser()
+    assert parser.receive(nmea(f"GNTHS,77.5,{mode}"), NOON_NS) is None
+    assert parser.receive(gga(), NOON_NS).heading_deg == heading_deg
+
+
+def test_a_sentence_that_nobody_knows_is_ignored():
+    assert NmeaParser().receive(nmea("PXYZ,1,2"), NOON_NS) is None
+    assert NmeaParser().receive(nmea("GNQQQ,1,2"), NOON_NS) is None
+
+
 def test_a_vehicle_that_stands_has_no_course():
     parser = NmeaParser()
     parser.receive(nmea("GPVTG,054.7,T,034.4,M,000.1,N,000.2,K"), NOON_NS)
@@ -143,6 +164,33 @@ def test_a_report_of_gpsd_is_a_fix_with_the_heading_of_att():
         '"track":80,"speed":9}'
     )
     assert (course.heading_deg, course.geodetic[2]) == (80.0, None)
+
+
+def tpv(time: str = "20.100", **more: object) -> str:
+    at = f"2023-11-14T22:13:{time}Z"
+    return json.dumps(
+        {"class": "TPV", "mode": 3, "time": at, "lat": 48.1, "lon": 11.5, "altHAE": 519.2, **more}
+    )
+
+
+def test_a_heading_without_a_time_is_that_of_the_next_position():
+    """gpsd 3.22 reports HDT so."""
+    parser = JsonParser()
+    assert parser.receive('{"class":"ATT","device":"/dev/ttyS0","heading":123.4}') is None
+    assert parser.receive(tpv()).heading_deg == 123.4
+    assert parser.receive(tpv("21.100")).heading_deg is None
+
+
+def test_standard_deviations_are_those_of_gst_then_of_the_kind_of_solution_then_of_gpsd():
+    """gpsd 3.22 leaves RTK out of its estimates: eph 24.7 m where GST says 1 cm."""
+    parser = JsonParser()
+    fixed = tpv(status=3, eph=24.7, epv=48.3)
+    assert parser.receive(fixed).position_std_m == pytest.approx((0.03, 0.03, 0.045))
+    gst = '{"class":"GST","time":"2023-11-14T22:13:20.000Z","lat":0.012,"lon":0.02,"alt":0.025}'
+    assert parser.receive(gst) is None
+    assert parser.receive(fixed).position_std_m == pytest.approx((0.02, 0.012, 0.025))
+    later = tpv("30.000", status=1, eph=3.92, epv=9.8)
+    assert parser.receive(later).position_std_m == pytest.approx((2.0, 2.0, 5.0))
 
 
 @pytest.mark.parametrize(
