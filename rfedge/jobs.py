@@ -22,6 +22,7 @@ import json
 import os
 import socket
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -260,6 +261,14 @@ class _Lines:
     def __init__(self) -> None:
         self._lines: list[str] = []
 
+        self._begun: Counter[str] = Counter()
+
+    def begin(self, name: str) -> int:
+        """Count that a job begins, and return how often it did: Ray itself does not count the
+        tasks that its memory monitor kills."""
+        self._begun[name] += 1
+        return self._begun[name]
+
     def add(self, line: str) -> None:
         self._lines.append(line)
 
@@ -305,6 +314,8 @@ def _reached(address: str, machines: Sequence[dict[str, float]]) -> str:
 
 
 def _run_on_worker(job: Job, lines: Any) -> str | None:
+    if _ray().get(lines.begin.remote(job.name)) > RETRIES + 1:
+        return f"begun {RETRIES + 1} times, each time killed; give it more memory"
     # Waits for nothing while the job works: Ray lends the cores of a task that waits to others.
     problem = _run_telling(job, lambda line: lines.add.remote(line))
     _ray().get(lines.have_arrived.remote())

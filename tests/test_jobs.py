@@ -5,11 +5,13 @@ import signal
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
+from rfedge import jobs
 from rfedge.jobs import RETRIES, Job, Tell, console_of, run_jobs
 
 
@@ -115,6 +117,20 @@ def test_on_ray_jobs_that_fail_or_whose_workers_die_are_listed_and_stop_nobody(t
     assert "good: done" in told
     deaths = (tmp_path / "deaths").read_text().split()
     assert len(set(deaths)) == RETRIES + 1, "each time in another process"
+
+
+def test_a_job_that_ray_kills_again_and_again_is_given_up(tmp_path, monkeypatch):
+    """Ray 2.60 begins what its memory monitor killed without end, whatever ``max_retries`` says."""
+    lines = jobs._Lines()
+    remote = {name: SimpleNamespace(remote=getattr(lines, name)) for name in ("begin", "add")}
+    remote["have_arrived"] = SimpleNamespace(remote=lines.have_arrived)
+    monkeypatch.setattr(jobs, "_ray", lambda: SimpleNamespace(get=lambda value: value))
+    found = [
+        jobs._run_on_worker(job(tmp_path, "greedy"), SimpleNamespace(**remote))
+        for _ in range(RETRIES + 2)
+    ]
+    assert found[:-1] == [None] * (RETRIES + 1)
+    assert found[-1].startswith("begun 4 times, each time killed")
 
 
 def test_a_ray_that_nobody_runs_is_an_error_at_once(tmp_path, free_port):

@@ -35,6 +35,7 @@ from rfcore.wire.nats import (
     WANTED_S,
     NatsServers,
     VehicleLocation,
+    header_bytes,
     key_of,
     picture_subject,
     wanted_encoding,
@@ -46,7 +47,6 @@ from rfcore.wire.twin import Departure, PictureEncoding, Subscription, twin_mess
 with needs("nats"):
     from nats.aio.client import Client
     from nats.aio.msg import Msg
-    from nats.errors import MaxPayloadError
     from nats.js.errors import BadRequestError, KeyNotFoundError, KeyWrongLastSequenceError
     from nats.js.kv import KeyValue
 
@@ -163,13 +163,13 @@ class TwinPublisher:
             message = picture_message(view, age_s, encoding, data, self._mailbox.skipped[view.key])
             subject = picture_subject(encoding, *view.key)
             body = twin_message_to_wire(message).SerializeToString()
-            try:
-                await client.publish(subject, body, headers=headers)
-            except MaxPayloadError:
+            size_bytes = header_bytes(headers) + len(body)
+            if size_bytes > client.max_payload:
                 self._too_large += 1
                 log.warning("picture larger than NATS takes", vehicle=view.vehicle_id,
-                            size_bytes=len(body), limit_bytes=client.max_payload)  # fmt: skip
+                            size_bytes=size_bytes, limit_bytes=client.max_payload)  # fmt: skip
                 continue
+            await client.publish(subject, body, headers=headers)
             self._metrics.nats_published.labels(encoding).inc()
 
     async def _publish_departure(self, client: Client, departure: Departure) -> None:

@@ -36,6 +36,17 @@ PLACES_BUCKET: Final = "rfedge-places"
 FIELDS_BUCKET: Final = "rfedge-fields"
 PLACE_HEADER: Final = "Rfedge-Place"
 
+
+def header_bytes(headers: Mapping[str, str]) -> int:
+    """Return the bytes of a message's headers, which count against the server's limit of a message.
+
+    nats-py 2.16 compares the body alone with it; a message that exceeds it with its headers costs
+    the connection.
+    """
+    lines = [f"{name}: {value}" for name, value in headers.items()]
+    return len("\r\n".join(["NATS/1.0", *lines, "", ""]).encode())
+
+
 EXPIRES_S: Final = 6.0
 """A session that was silent for this long is over."""
 WANTED_EVERY_S: Final = 0.5

@@ -25,7 +25,13 @@ from mec_server.config import NatsSettings
 from mec_server.nats import NatsLink, fetch_object
 from mec_server.twin.nats import PlaceRecords
 from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
-from rfcore.wire.nats import FIELDS_BUCKET, PLACES_BUCKET, NatsServers, VehicleLocation
+from rfcore.wire.nats import (
+    FIELDS_BUCKET,
+    PLACES_BUCKET,
+    NatsServers,
+    VehicleLocation,
+    header_bytes,
+)
 from rfcore.wire.tile_manifest import MANIFEST, Ground, publish
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import Departure, PictureEncoding, Subscription, TwinPicture
@@ -148,6 +154,17 @@ async def connected(broker: NatsServer) -> AsyncIterator[Any]:
         yield client
     finally:
         await client.close()
+
+
+async def test_headers_count_against_the_limit_of_a_message(broker: NatsServer) -> None:
+    async with connected(broker) as client:
+        heard = await client.subscribe("subject")
+        headers = {"Rfedge-Place": "a place", "Other": "more"}
+        most = client.max_payload - header_bytes(headers)
+        await client.publish("subject", bytes(most), headers=headers)
+        assert len((await heard.next_msg(10)).data) == most
+        await client.publish("subject", bytes(most + 1), headers=headers)
+        await until(lambda: "maximum payload" in str(client.last_error).lower())
 
 
 async def test_of_two_servers_that_write_a_vehicles_place_the_newer_session_stays(
