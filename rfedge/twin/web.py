@@ -39,6 +39,11 @@ log = structlog.get_logger()
 
 PAGE: Final = Path(__file__).parent / "page"
 MAX_BROWSERS: Final = 16
+MAX_CONNECTIONS: Final = 128
+"""A browser opens up to six beside its socket; those beyond are closed at once."""
+FIRST_REQUEST_S: Final = 5.0
+"""A connection that has sent no whole request by then is closed; so is one idle for KEPT_S."""
+KEPT_S: Final = 15.0
 LONGEST_REQUEST_BYTES: Final = 4096
 HEARTBEAT_S: Final = 10.0
 EXIT_SEEN_S: Final = 1.0
@@ -118,6 +123,8 @@ class TwinWeb:
         self._clock = clock
         self._browsers: set[web.WebSocketResponse] = set()
         self._runner: web.AppRunner | None = None
+        self._listening: asyncio.Server | None = None
+        self._silent: set[asyncio.Protocol] = set()
 
     async def start(self) -> str:
         """Listen; return the page's address. Raises ``RfedgeError`` where the port is taken."""
@@ -129,11 +136,11 @@ class TwinWeb:
         app.router.add_get("/socket", self._socket)
         app.router.add_get("/splats/{field}.spz", self._splats)
         app.router.add_static("/page", PAGE)
-        self._runner = web.AppRunner(app, access_log=None)
+        self._runner = web.AppRunner(app, access_log=None, keepalive_timeout=KEPT_S)
         await self._runner.setup()
-        site = web.TCPSite(self._runner, address.host, address.port)
-        await site.start()
-        port = self._runner.addresses[0][1]
+        loop = asyncio.get_running_loop()
+        self._listening = await loop.create_server(self._connection, address.host, address.port)
+        port = self._listening.sockets[0].getsockname()[1]
         query = f"?token={self._settings.token}" if self._settings.token else ""
         return f"http://{Address(address.host, port)}/{query}"
 
@@ -141,12 +148,34 @@ class TwinWeb:
         """Close every browser's socket and the port."""
         for socket in tuple(self._browsers):
             await socket.close(code=WSCloseCode.GOING_AWAY, message=b"rfedge twin ends")
+        if self._listening is not None:
+            self._listening.close()
         if self._runner is not None:
             await self._runner.cleanup()
+
+    def _connection(self) -> asyncio.Protocol:
+        """Make the protocol of a new connection, which is given little time and no more than there
+        is room for."""
+        assert self._runner is not None
+        server = self._runner.server
+        assert server is not None
+        if len(server.connections) >= MAX_CONNECTIONS:
+            return _Refused()
+        handler = server()
+        self._silent.add(handler)
+        asyncio.get_running_loop().call_later(FIRST_REQUEST_S, self._close_silent, handler)
+        return handler
+
+    def _close_silent(self, handler: web.RequestHandler[web.Request]) -> None:
+        if handler in self._silent:
+            self._silent.discard(handler)
+            if handler.transport is not None:
+                handler.transport.abort()
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse browsers without the token; set the headers that restrict the page."""
+        self._silent.discard(request.protocol)
         if request.path != HEALTH and not self._is_known(request):
             raise web.HTTPForbidden(text="this page needs its token: /?token=...\n")
         response = await handler(request)
@@ -154,7 +183,7 @@ class TwinWeb:
             response.headers["Content-Security-Policy"] = POLICY
             response.headers["Referrer-Policy"] = "no-referrer"
             response.headers["X-Content-Type-Options"] = "nosniff"
-            if request.query.get("token"):
+            if request.query.get("token") and request.path != HEALTH:
                 response.set_cookie(
                     COOKIE, request.query["token"], httponly=True, samesite="Strict"
                 )
@@ -165,7 +194,7 @@ class TwinWeb:
         if token is None:  # a name that resolves to this machine is no proof (DNS rebinding)
             return _host(request.host).is_loopback
         given = request.query.get("token") or request.cookies.get(COOKIE) or ""
-        return hmac.compare_digest(given.encode(), token.encode())
+        return hmac.compare_digest(given.encode(errors="backslashreplace"), token.encode())
 
     async def _healthy(self, _: web.Request) -> web.StreamResponse:
         return web.Response(text="ok\n")
@@ -241,6 +270,13 @@ class TwinWeb:
             await socket.close(code=WSCloseCode.POLICY_VIOLATION)
 
 
+class _Refused(asyncio.Protocol):
+    """Closes a connection that there is no room for."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        transport.close()
+
+
 class _User:
     """The interests of one browser's user: a camera, objects, a live view."""
 
@@ -306,9 +342,11 @@ def wish(text: str) -> Select | Look | ShowObjects:
 def _viewpoint(place: dict[str, Any]) -> ViewRequest:
     try:
         intrinsics = Intrinsics(**place["intrinsics"])
+        if type(intrinsics.width_px) is not int or type(intrinsics.height_px) is not int:
+            raise InvalidInput("intrinsics", "width and height are whole numbers of pixels")
         pose = Pose(tuple(place["translation_m"]), tuple(place["rotation_wxyz"]))
         return ViewRequest(Camera(intrinsics, pose), field_id=place["field"])
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"look: {error!r}") from error
 
 

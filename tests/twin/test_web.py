@@ -7,17 +7,19 @@ import json
 import struct
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Executor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 from unittest.mock import Mock
 
 import aiohttp
 import pytest
+from yarl import URL
 
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.wire.address import Address
 from rfcore.wire.twin_render import ViewRequest
+from rfedge.twin import web as module
 from rfedge.twin.comparing import Comparer
 from rfedge.twin.scene import Board, Message, PlacedField, TwinScene
 from rfedge.twin.web import Look, Select, ShowObjects, TwinWeb, WebSettings, wish
@@ -94,6 +96,37 @@ async def test_without_the_token_nothing_is_given() -> None:
 async def test_health_is_told_without_the_token_and_nothing_else() -> None:
     async with site(TOKEN) as made, made.session.get(made.url + "healthy") as response:
         assert (response.status, await response.text()) == (200, "ok\n")
+
+
+async def test_health_gives_no_cookie_and_a_cookie_of_other_bytes_is_wrong() -> None:
+    async with site(TOKEN) as made:
+        async with made.session.get(f"{made.url}healthy?token=x") as response:
+            assert "Set-Cookie" not in response.headers
+        reader, writer = await asyncio.open_connection("127.0.0.1", URL(made.url).port)
+        writer.write(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: rfedge-twin=\xff\r\n\r\n")
+        assert b" 403 " in await reader.readline()
+        writer.close()
+
+
+async def test_connections_that_ask_nothing_are_closed_and_so_are_those_beyond_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "MAX_CONNECTIONS", 3)
+    monkeypatch.setattr(module, "FIRST_REQUEST_S", 1.0)
+    async with site() as made, asyncio.timeout(15):
+        port = URL(made.url).port
+        halves = [await asyncio.open_connection("127.0.0.1", port) for _ in range(3)]
+        for _, writer in halves:
+            writer.write(b"GET / HTTP/1.1\r\n")
+        fourth, spare = await asyncio.open_connection("127.0.0.1", port)
+        assert await fourth.read() == b"", "closed at once"
+        spare.close()
+        for reader, writer in halves:
+            with suppress(ConnectionError):
+                assert await reader.read() == b"", "closed when its time is over"
+            writer.close()
+        async with made.session.get(made.url) as response:
+            assert response.status == 200
 
 
 async def test_a_foreign_name_for_this_machine_is_refused() -> None:
@@ -189,6 +222,9 @@ PLACE = {
         json.dumps({"look": {**PLACE, "translation_m": ["a", 0, 0]}}),
         json.dumps({"look": {**PLACE, "intrinsics": {"width_px": 1}}}),
         json.dumps({"look": {"field": "ab" * 32}}),
+        json.dumps({"look": {**PLACE, "translation_m": [10**400, 0, 0]}}),
+        json.dumps({"look": {**PLACE, "intrinsics": {**PLACE["intrinsics"], "width_px": 64.5}}}),
+        '{"look": ' + "[" * 1500 + "]" * 1500 + "}",
     ],
 )
 def test_what_the_page_never_says_is_refused(text: str) -> None:
