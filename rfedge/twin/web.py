@@ -166,7 +166,7 @@ class TwinWeb:
         asyncio.get_running_loop().call_later(FIRST_REQUEST_S, self._close_silent, handler)
         return handler
 
-    def _close_silent(self, handler: web.RequestHandler[web.Request]) -> None:
+    def _close_silent(self, handler: web.RequestHandler) -> None:
         if handler in self._silent:
             self._silent.discard(handler)
             if handler.transport is not None:
