@@ -35,8 +35,8 @@ from cav_agent.server_connection import ServerConnection, retry_after_s
 from cav_agent.session import AgentSession, LinkState
 from rfcore.errors import ProtocolError, RfedgeError
 from rfcore.wire.conventions import AGENT_PROCESS, STREAM_METHOD, TILE, VEHICLE
-from rfcore.wire.convert_answers import server_messages_from_bytes
-from rfcore.wire.messages import FieldNotice, Welcome
+from rfcore.wire.convert_answers import AnswerReader
+from rfcore.wire.messages import FieldNotice, PoseAhead, Welcome
 from rfcore.wire.notices import StreetNotice
 
 log = structlog.get_logger()
@@ -90,7 +90,7 @@ class CameraSource:
     """Takes the pictures at a place of the drive, posed for the stream's tile, and encodes them."""
 
     take: Callable[[int], Sequence[Capture]]
-    encode: Callable[[EncodeJob], EncodedFrame]
+    encode: Callable[[EncodeJob, Callable[[PoseAhead], None]], EncodedFrame]
     executor: Executor
 
 
@@ -244,14 +244,22 @@ class StreamClient:
 
     async def _encode(self, job: EncodeJob) -> None:
         loop, source = asyncio.get_running_loop(), self._source
+
+        def announce(ahead: PoseAhead) -> None:
+            loop.call_soon_threadsafe(self._located, job, ahead)
+
         try:
-            encoded = await loop.run_in_executor(source.executor, source.encode, job)
+            encoded = await loop.run_in_executor(source.executor, source.encode, job, announce)
         except RfedgeError as error:
             self._session.encoding_failed(error)
         else:
             self._session.encoded(encoded, time.monotonic())
         finally:
             self._changed.set()
+
+    def _located(self, job: EncodeJob, ahead: PoseAhead) -> None:
+        self._session.located(job, ahead)
+        self._may_write.set()
 
     # --- the stream
 
@@ -326,8 +334,9 @@ class StreamClient:
         return StreamEnd(EndReason.STREAM_LOST, f"{error.code().name}: {details}")
 
     async def _read(self, stream: Stream) -> None:
+        reader = AnswerReader(self._session.camera_ids)
         async for data in stream:
-            messages = server_messages_from_bytes(data)
+            messages = reader.messages(data)
             if not messages:
                 self._observer.message_unknown()
             for message in messages:

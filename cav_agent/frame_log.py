@@ -254,7 +254,7 @@ def _pose_of(fix: PoseEstimate) -> dict[str, Any]:
 def _stage_ms(result: FrameResult) -> dict[str, float]:
     stage_ms = {stage: spent_s * 1e3 for stage, spent_s in result.stage_s.items()}
     if result.server is not None:
-        for stage in ("queue", "render", "splice", "decode", "total"):
+        for stage in ("queue", "ahead", "render", "splice", "decode", "total"):
             stage_ms[f"server_{stage}"] = getattr(result.server, f"{stage}_ns") / 1e6
     if result.link_s is not None:
         stage_ms["link"] = result.link_s * 1e3

@@ -167,7 +167,9 @@ class FrameResult:
     """The cause in words."""
     encoded: EncodedFrame | None = None
     packet_bytes: int = 0
-    """The whole message as sent."""
+    """The whole message as sent, with the pose ahead of it."""
+    ahead_bytes: int = 0
+    """The pose that was sent ahead of it; 0: none was."""
     budget: ByteBudget | None = None
     session_id: str = ""
     """The stream it was encoded for."""

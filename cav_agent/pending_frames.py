@@ -15,6 +15,8 @@ only a timeout notices that. It adapts to the stream: ``AgentLimits.stall_s``, p
 the bytes in flight need at ``SLOWEST_BPS``, plus twice the longest of the last answers.
 
 ``PredictionChain`` numbers epochs and says which frame the next may be predicted from.
+
+``AheadSwitch`` says whether poses are sent ahead of their frames.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from statistics import StatisticsError, fmean, linear_regression
 
 from cav_agent.config import AgentLimits
 from cav_agent.frames import Capture, FrameResult
@@ -269,3 +272,63 @@ class PredictionChain:
             self.epoch = max(self.epoch, above) + 1
             self._epoch_used = False
         self.base = self._decoded
+
+
+AHEAD_FRAMING_BYTES = 80
+"""gRPC, HTTP/2, TLS, TCP and IP around a pose ahead, which is a packet of its own."""
+
+AHEAD_ANSWERS = 4
+"""Answers before it is judged whether poses ahead pay."""
+
+AHEAD_TRY_EVERY = 32
+"""So often a pose is sent ahead of its frame although that did not pay lately."""
+
+
+class AheadSwitch:
+    """Sends poses ahead of their frames as long as that shows pictures sooner.
+
+    What an answer says was done before its frame came, less what the frame waited for it, is won. A
+    server that is full does nothing ahead. Lost is the time that the pose's bytes take on the link,
+    by how much longer answers to larger frames take.
+    """
+
+    def __init__(self, is_wanted: bool) -> None:
+        self._is_wanted = is_wanted
+        self._skipped = 0
+        self._links: deque[tuple[int, float]] = deque(maxlen=2 * REMEMBERED_ANSWERS)
+        """Bytes and link time of the last answered frames."""
+        self._won_s: deque[float] = deque(maxlen=REMEMBERED_ANSWERS)
+        """Time won by the last frames with a pose ahead."""
+
+    def next(self) -> bool:
+        """Return whether to send the next pose ahead of its frame."""
+        if not self._is_wanted:
+            return False
+        self._skipped += 1
+        is_new = len(self._won_s) < AHEAD_ANSWERS
+        is_tried = is_new or fmean(self._won_s) > 0 or self._skipped >= AHEAD_TRY_EVERY
+        if is_tried:
+            self._skipped = 0
+        return is_tried
+
+    def answered(self, result: FrameResult) -> None:
+        """Learn from a frame that was acknowledged."""
+        if result.server is None or result.link_s is None:
+            return
+        self._links.append((result.packet_bytes, result.link_s))
+        if result.ahead_bytes:
+            won_ns = max(0, result.server.ahead_ns - result.server.queue_ns)
+            lost_s = self._s_per_byte() * (result.ahead_bytes + AHEAD_FRAMING_BYTES)
+            self._won_s.append(won_ns / 1e9 - lost_s)
+
+    def failed(self) -> None:
+        """Note that a frame with a pose ahead was refused: the next ones go without."""
+        self._won_s.clear()
+        self._won_s.extend([0.0] * AHEAD_ANSWERS)
+
+    def _s_per_byte(self) -> float:
+        """Return by how much a byte more delays an answer."""
+        try:
+            return max(0.0, linear_regression(*zip(*self._links, strict=True)).slope)
+        except StatisticsError:  # fewer than two sizes
+            return 0.0

@@ -29,7 +29,7 @@ from rfcore.field import Quality, Renderer, render_field_view
 from rfcore.image import I420, Rgb
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
-from rfcore.wire.messages import FrameAddress
+from rfcore.wire.messages import FrameAddress, PoseAhead
 from rfcore.wire.values import MAX_PAYLOAD_BYTES
 
 ClockNs = Callable[[], int]
@@ -99,8 +99,10 @@ class Pipeline:
         """Return what the server needs before the first packet."""
         return self._encoder.header
 
-    def encode(self, job: EncodeJob) -> EncodedFrame:
-        """Return the packet of ``job``'s picture.
+    def encode(
+        self, job: EncodeJob, announce: Callable[[PoseAhead], None] = lambda _: None
+    ) -> EncodedFrame:
+        """Return the packet of ``job``'s picture; call ``announce`` once its pose is known.
 
         Raises ``DatasetError`` for a picture that cannot be read, ``InvalidInput`` for one of
         another size, ``CodecError`` when coding fails, ``RfedgeError`` before a feed's first pose.
@@ -117,10 +119,12 @@ class Pipeline:
             stage_s, read_s = {"read": read_s} | stage_s, 0.0
             waited_s = job.started_s - received_s
         location = self._poses.locate(job.capture, frame, rung)
-        shown = self._view(frame, location, rung.quality)
-        field_id = "" if self._lights is None else self._lights.named_id
-        stage_s["render" if location.fix is None else "track"] = watch.lap_s()
         state = self._state_for(job)
+        if location.pose is not None:
+            announce(self._ahead(job.capture, location, rung.quality, state))
+        shown = self._view(frame, location, rung.quality)
+        field_id = self._field_id
+        stage_s["render" if location.fix is None else "track"] = watch.lap_s()
         choice = self._choice(job, rung)
         if shown is None:
             choice = without_field(choice, state)
@@ -148,6 +152,26 @@ class Pipeline:
             in_field=shown is not None and rung is self._rungs.current,
         )
         return made
+
+    @property
+    def _field_id(self) -> str:
+        return "" if self._lights is None else self._lights.named_id
+
+    def _ahead(
+        self, capture: Capture, location: CameraLocation, quality: Quality, state: EncoderState
+    ) -> PoseAhead:
+        return PoseAhead(
+            capture.camera_id,
+            state.epoch,
+            state.next_sequence,
+            capture.capture_time_ns,
+            location.pose,
+            self._field_id,
+            quality,
+            capture.clock,
+            location.state,
+            capture.instant,
+        )
 
     def encode_picture(
         self, picture: PosedPicture, epoch: int = 0, base: FrameAddress | None = None

@@ -2,9 +2,10 @@
 
 ``cav_agent.client`` moves bytes and time in and out of it. ``offer`` takes a captured picture, or
 those of one instant of a rig, of which the newest wait; ``job_to_start`` returns one to encode when
-the server's credit allows; ``encoded`` brings the packet back; ``messages_to_send`` returns what
-goes to the server, ``receive`` takes what came from it; ``get_timer`` returns when ``handle_timer``
-is to be called; ``take_results`` returns how pictures ended.
+the server's credit allows; ``located`` brings its pose, then ``encoded`` the packet;
+``messages_to_send`` returns what goes to the server, ``receive`` takes what came from it;
+``get_timer`` returns when ``handle_timer`` is to be called; ``take_results`` returns how pictures
+ended.
 
 Each camera has its own epochs and credits, so what is wrong with one leaves the others alone.
 Pictures are dropped only before they are encoded. A frame is predicted from the one sent before it,
@@ -17,7 +18,7 @@ frame is ever predicted from another.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -31,7 +32,12 @@ from cav_agent.frames import (
     Outcome,
     StreamEnd,
 )
-from cav_agent.pending_frames import FramesInFlight, PredictionChain, WaitingInstants
+from cav_agent.pending_frames import (
+    AheadSwitch,
+    FramesInFlight,
+    PredictionChain,
+    WaitingInstants,
+)
 from cav_agent.rate_control import BitDivision, ByteBudget, RateControl
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.convert import hello_to_bytes
@@ -47,6 +53,7 @@ from rfcore.wire.messages import (
     FrameAddress,
     Hello,
     Nack,
+    PoseAhead,
     ServerMessage,
     Welcome,
 )
@@ -71,6 +78,8 @@ class OutgoingMessage:
 
     message: ClientMessage
     data: bytes
+    packet_bytes: int = 0
+    """Of a frame: with the pose that was sent ahead of it."""
 
 
 @dataclass
@@ -91,7 +100,8 @@ class AgentSession:
     """The stream of the cameras of ``hello`` to one server.
 
     ``rate_control`` says how many bytes each instant may take, and ``bit_division`` how its
-    cameras share them; without the former all have the configured CRF. ``failed`` is set when the
+    cameras share them; without the former all have the configured CRF. ``pose_ahead``: poses may be
+    sent ahead of their frames, as long as that pays (``AheadSwitch``). ``failed`` is set when the
     server refused the vehicle's Hello, ``broken`` when it did not answer in time; either ends the
     stream. ``is_draining``: the server is about to stop, and goes on taking frames for a while.
     """
@@ -104,6 +114,7 @@ class AgentSession:
         bit_division: BitDivision | None = None,
         *,
         first_epoch: int = 0,
+        pose_ahead: bool = True,
     ) -> None:
         self.state = LinkState.DISCONNECTED
         self.session_id = ""
@@ -130,6 +141,9 @@ class AgentSession:
         self._job: EncodeJob | None = None
         self._job_is_after: tuple[FrameWriter, FrameAddress | None] = self._writer, None
         """Writer of the job's frame, and the frame that it will be sent after."""
+        self._ahead_pays = AheadSwitch(pose_ahead)
+        self._ahead_bytes = 0
+        """Bytes of the pose that was sent ahead of the job's frame."""
         self._outbox: deque[OutgoingMessage] = deque()
         self._results: deque[FrameResult] = deque()
         self._greeting_until_s = 0.0
@@ -138,6 +152,11 @@ class AgentSession:
     def vehicle_id(self) -> str:
         """The vehicle's name."""
         return self._hello.vehicle_id
+
+    @property
+    def camera_ids(self) -> Sequence[str]:
+        """The cameras in the order of Hello."""
+        return tuple(self._cameras)
 
     @property
     def epoch(self) -> int:
@@ -222,6 +241,7 @@ class AgentSession:
         frame = self._in_flight.acked(ack, now)
         if frame is None:
             return
+        self._ahead_pays.answered(frame.result)
         packet = frame.result.packet
         if packet is not None and packet.reconstruction_digest == ack.reconstruction_digest:
             self._cameras[ack.address.camera_id].chain.decoded(ack.address)
@@ -249,6 +269,8 @@ class AgentSession:
         overloaded = nack.reason is RejectReason.OVERLOADED
         outcome = Outcome.LOST if overloaded else Outcome.NACKED
         for address, frame in self._in_flight.refused_by(nack):
+            if frame.result.ahead_bytes:
+                self._ahead_pays.failed()
             if nack.reason is RejectReason.UNKNOWN_STATE:
                 self._cameras[address.camera_id].chain.unknown_to_server(frame.base)
             self._finish(address, outcome, nack.reason, nack.problem, now)
@@ -322,13 +344,24 @@ class AgentSession:
                 return
             self._drop(self._waiting.drop_oldest(), EndReason.TOO_LATE)
 
+    def located(self, job: EncodeJob, ahead: PoseAhead) -> None:
+        """Send the pose of the running job's picture ahead of its frame, if that pays."""
+        if job is not self._job or self._obstacle(job) is not None or not self._ahead_pays.next():
+            return
+        writer, after = self._job_is_after
+        outgoing = OutgoingMessage(ahead, writer.ahead(ahead, after))
+        self._ahead_bytes = len(outgoing.data)
+        self._outbox.append(outgoing)
+
     def encoded(self, encoded: EncodedFrame, now: float) -> None:
         """Send the frame of the running job, if its stream still is the same."""
+        ahead_bytes = self._ahead_bytes
         job = self._take_job()
         frame = self._frame(job.capture, encoded)
         writer, after = self._job_is_after
-        outgoing = OutgoingMessage(frame, writer.message(frame, after))
-        payload_bytes, packet_bytes = len(encoded.packet.payload), len(outgoing.data)
+        data = writer.message(frame, after)
+        payload_bytes, packet_bytes = len(encoded.packet.payload), ahead_bytes + len(data)
+        outgoing = OutgoingMessage(frame, data, packet_bytes)
         if self._rate_control is not None:
             self._rate_control.coded(encoded.sender_s, payload_bytes, packet_bytes)
         if encoded.crf is not None:
@@ -338,6 +371,7 @@ class AgentSession:
             Outcome.LOST,
             encoded=encoded,
             packet_bytes=packet_bytes,
+            ahead_bytes=ahead_bytes,
             budget=job.budget,
             session_id=self.session_id,
         )
@@ -386,6 +420,7 @@ class AgentSession:
         if self._job is None:
             raise InvalidInput("encoded", "no picture is being encoded")
         job, self._job = self._job, None
+        self._ahead_bytes = 0
         return job
 
     def _frame(self, capture: Capture, encoded: EncodedFrame) -> Frame:
@@ -432,7 +467,7 @@ class AgentSession:
         self._outbox.clear()
         for entry in outgoing:
             if isinstance(entry.message, Frame):
-                self._sent(entry.message.address, len(entry.data), now)
+                self._sent(entry.message.address, entry.packet_bytes, now)
         return outgoing
 
     def _sent(self, address: FrameAddress, packet_bytes: int, now: float) -> None:

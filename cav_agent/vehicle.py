@@ -61,7 +61,7 @@ from rfcore.field import RadianceField
 from rfcore.field.own import OwnField, own_field
 from rfcore.named_class import is_named_class
 from rfcore.wire.instruments import Family, MetricsEndpoint
-from rfcore.wire.messages import CameraDescription, Hello, RendererContract
+from rfcore.wire.messages import CameraDescription, Hello, PoseAhead, RendererContract
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.tiles import Tile
@@ -326,8 +326,8 @@ class StreamFactory:
             for camera, poses in zip(prepared.cameras, self._camera_poses(prepared), strict=True)
         }
 
-        def encode(job: EncodeJob) -> EncodedFrame:
-            return pipelines[job.capture.camera_id].encode(job)
+        def encode(job: EncodeJob, announce: Callable[[PoseAhead], None]) -> EncodedFrame:
+            return pipelines[job.capture.camera_id].encode(job, announce)
 
         session = self._session(self._hello(prepared, pipelines), prepared)
         source = CameraSource(prepared.pictures.take, encode, self._encoder)
@@ -433,7 +433,12 @@ class StreamFactory:
         cameras = prepared.pictures.cameras
         division = BitDivision({camera.camera_id: camera.priority for camera in cameras})
         session = AgentSession(
-            hello, self._config.limits, rate_control, division, first_epoch=first_epoch
+            hello,
+            self._config.limits,
+            rate_control,
+            division,
+            first_epoch=first_epoch,
+            pose_ahead=self._config.pose_ahead,
         )
         self._sessions.append(session)
         return session

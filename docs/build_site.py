@@ -77,6 +77,7 @@ FORMATS: Mapping[str, str] = {
     "Deltas of fields": "rfcore.field.delta",
     "Coded drives, `.rfv`": "rfcore.wire.drive_file",
     "Heads of frames, on the wire and in drives": "rfcore.wire.head",
+    "Answers to frames": "rfcore.wire.convert_answers",
     "Published tiles, `tiles.json`": "rfcore.wire.tile_manifest",
     "Recordings of a server": "rfcore.dataset.recorded_session",
 }

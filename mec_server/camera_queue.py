@@ -10,17 +10,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
-from rfcore.codec.packet import CheckedPacket, check_packet
+from rfcore.codec.packet import check_order
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.wire.messages import (
     MAX_EPOCH_STEP,
+    AnyPosed,
     CameraDescription,
     Credit,
     Frame,
     FrameAddress,
     Hello,
+    PoseAhead,
 )
 
 MAX_GAP = 64
@@ -44,7 +47,10 @@ class SequenceGap:
 
 
 class CameraQueue:
-    """The frames of one camera. ``window`` frames may be unanswered at a time."""
+    """The frames of one camera. ``window`` frames may be unanswered at a time.
+
+    The newest pose ahead of a frame waits beside them, until it is prepared or its frame is here.
+    """
 
     def __init__(self, window: int) -> None:
         self.epoch: int | None = None
@@ -53,6 +59,8 @@ class CameraQueue:
         self._window = window
         self._queue: deque[WaitingFrame] = deque()
         self._running: WaitingFrame | None = None
+        self._ahead: PoseAhead | None = None
+        self._is_preparing = False
         self._refused: set[tuple[int, int]] = set()
 
     @property
@@ -73,32 +81,52 @@ class CameraQueue:
                 f"{self.outstanding} frames are waiting, {self._window} may; wait for Credit",
             )
         self._queue.append(WaitingFrame(frame, now))
+        self._ahead = None
+
+    def expect(self, ahead: PoseAhead) -> None:
+        """Take a pose ahead of its frame in, in place of the one before."""
+        self._ahead = ahead
+
+    def prepare(self) -> PoseAhead | None:
+        """Return, once, the pose to prepare; None while there is a frame to decode.
+
+        Raises ``PacketRejected`` for one whose frame could not follow what was reconstructed last.
+        """
+        if self._ahead is None or self.outstanding or self._is_preparing:
+            return None
+        ahead, self._ahead = self._ahead, None
+        self.check(ahead)
+        self._is_preparing = True
+        return ahead
+
+    def prepared(self) -> None:
+        """Note that the work of ``prepare`` is done: the next frame may be decoded."""
+        self._is_preparing = False
 
     def start(self) -> WaitingFrame | None:
         """Return the next frame to decode, or None while one is running or none waits."""
-        if self._running is not None or not self._queue:
+        if self._running is not None or self._is_preparing or not self._queue:
             return None
         self._running = self._queue.popleft()
         return self._running
 
-    def check(self, frame: Frame) -> CheckedPacket:
-        """Return the packet of a frame; raise ``PacketRejected`` if it cannot follow what was
-        reconstructed last."""
-        packet = frame.packet
-        current = packet.epoch if self.epoch is None else self.epoch
-        checked = check_packet(packet, current, self._expected(current))
-        if packet.epoch > current + MAX_EPOCH_STEP:
+    def check(self, numbered: Frame | PoseAhead) -> int:
+        """Return how many frames are lost right before this one; raise ``PacketRejected`` if it
+        cannot follow what was reconstructed last."""
+        epoch, sequence = numbered.address.epoch, numbered.address.sequence
+        current = epoch if self.epoch is None else self.epoch
+        lost = check_order(epoch, sequence, current, self._expected(current))
+        if epoch > current + MAX_EPOCH_STEP:
             raise PacketRejected(
                 RejectReason.INVALID_ARGUMENT,
-                f"frame.epoch: {packet.epoch} leads {current} by more than {MAX_EPOCH_STEP}",
+                f"frame.epoch: {epoch} leads {current} by more than {MAX_EPOCH_STEP}",
             )
-        if checked.lost > MAX_GAP:
+        if lost > MAX_GAP:
             raise PacketRejected(
                 RejectReason.INVALID_ARGUMENT,
-                f"frame.sequence: {packet.sequence} skips {checked.lost} frames, "
-                f"at most {MAX_GAP} can be lost",
+                f"frame.sequence: {sequence} skips {lost} frames, at most {MAX_GAP} can be lost",
             )
-        return checked
+        return lost
 
     def succeed(self) -> list[SequenceGap]:
         """Note that the running frame was reconstructed.
@@ -161,17 +189,17 @@ class SessionCameras:
         """Whether a frame of any camera was taken and is not answered yet."""
         return any(queue.outstanding for queue in self._queues.values())
 
-    def queue_of(self, frame: Frame) -> CameraQueue:
+    def queue_of(self, frame: Frame | PoseAhead) -> CameraQueue:
         """Return the queue of a frame's camera; raise ``InvalidInput`` before ``open``."""
         if frame.camera_id not in self._queues:
             raise InvalidInput("frame", "came before Welcome; wait for that")
         return self._queues[frame.camera_id]
 
-    def posed(self, frame: Frame) -> Frame:
+    def posed(self, frame: AnyPosed) -> AnyPosed:
         """Return the frame of a queue at the pose of its camera, which came as that of its rig."""
         return self._descriptions[frame.camera_id].posed(frame)
 
-    def field_of(self, frame: Frame) -> str:
+    def field_of(self, frame: Frame | PoseAhead) -> str:
         """Return the id of the field that the frame of a queue is predicted from."""
         return frame.field_id or self._first_field_id
 
@@ -196,6 +224,16 @@ class SessionCameras:
         for queue in self._queues.values():
             while (waiting := queue.start()) is not None:
                 yield queue, waiting
+
+    def to_prepare(self) -> Iterator[tuple[CameraQueue, PoseAhead]]:
+        """Take out, camera by camera, every pose that may be prepared now.
+
+        One that its queue refuses is dropped: its frame, when it comes, is told why.
+        """
+        for queue in self._queues.values():
+            with suppress(PacketRejected):
+                if (ahead := queue.prepare()) is not None:
+                    yield queue, ahead
 
     def position(self, address: FrameAddress) -> tuple[int, int | None]:
         """Return the current epoch of a camera, and the last good sequence if it is of that of

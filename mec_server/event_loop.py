@@ -42,6 +42,9 @@ class FairQueue(Generic[T]):
     def __init__(self) -> None:
         self._waiting: OrderedDict[str, deque[T]] = OrderedDict()
 
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
     def put(self, owner: str, item: T) -> None:
         """Add ``item`` behind the other items of ``owner``."""
         self._waiting.setdefault(owner, deque()).append(item)
@@ -127,6 +130,12 @@ class Workers:
             self._permits.put(False)  # ends whichever thread gets to it first
             with self._lock:
                 self._substitutes -= 1
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a thread is free, and no work waits for one."""
+        with self._lock:
+            return not self._waiting and self._in_work.total() < self.count
 
     def close(self) -> None:
         """Finish the work that was submitted, then end the threads; waits for them."""

@@ -97,8 +97,17 @@ class ServerMetrics:
         )
         self.received = make.counter(
             "rfedge_server_received_bytes",
-            "Bytes of coded frames received: pose, header and payload.",
+            "Bytes of coded frames received: pose, header and payload, and of poses ahead of them.",
             vehicle,
+        )
+        self.poses_ahead = make.counter(
+            "rfedge_server_poses_ahead",
+            "Poses that came ahead of their frames: taken, or refused as damaged or repeated.",
+            ("result",),
+        )
+        self.poses_prepared = make.counter(
+            "rfedge_server_poses_prepared",
+            "Poses that were rendered before their frames came; the others found no worker free.",
         )
         self.payload = make.counter(
             "rfedge_server_payload_bytes",
@@ -112,12 +121,13 @@ class ServerMetrics:
         )
         self.stages = make.seconds(
             "rfedge_server_stage_seconds",
-            "Time of a frame by stage: queue (waiting), render, splice, decode.",
+            "Time of a frame by stage: queue (waiting), render, splice, decode; ahead: the work "
+            "done before the frame came, of those with any.",
             ("stage",),
         )
         self._stages = [(f"{stage}_ns", self.stages.labels(stage)) for stage in STAGES]
         self.answer = make.seconds(
-            "rfedge_server_frame_seconds", "From a frame's arrival to its Ack."
+            "rfedge_server_frame_seconds", "From the last byte of a frame to its Ack."
         )
         self.latency = make.seconds(
             "rfedge_server_capture_to_picture_seconds",
@@ -257,6 +267,8 @@ class ServerMetrics:
         self.frames.labels("acked", "")
         for reason in RejectReason:
             self.frames.labels("nacked", reason)
+        for taken in ("taken", "refused"):
+            self.poses_ahead.labels(taken)
         for limit in Limit:
             self.limited.labels(limit)
         for cause in LossCause:
@@ -269,7 +281,8 @@ class ServerMetrics:
     def observe_stages(self, times: StageTimes) -> None:
         """Observe the time of a frame, stage by stage."""
         for name, stage in self._stages:
-            stage.observe(getattr(times, name) / 1e9)
+            if times.ahead_ns or name != "ahead_ns":
+                stage.observe(getattr(times, name) / 1e9)
         self.answer.observe(times.total_ns / 1e9)
 
     def observe_ledger(self, entry: EntryControl, limiter: LogLimiter) -> None:
@@ -374,6 +387,11 @@ class VehicleMetrics:
         self._received.inc(packet_bytes)
         self._metrics.payload.labels(*labels).inc(len(packet.payload))
         self._metrics.coded.labels(*labels).inc()
+
+    def received_ahead(self, message_bytes: int) -> None:
+        """Count a pose ahead of its frame."""
+        self._received.inc(message_bytes)
+        self._metrics.poses_ahead.labels("taken").inc()
 
     def answered(self, messages: Iterable[ServerMessage]) -> None:
         """Count the frames that ``messages`` answer."""

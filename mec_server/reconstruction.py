@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
@@ -19,11 +20,14 @@ from mec_server.event_loop import Workers
 from mec_server.ledger.ledger import Hold
 from mec_server.metrics import BackgroundTask, OpeningResult, ServerMetrics
 from mec_server.recorder import Recorder, SessionRecording
-from mec_server.session import DecodeJob, OpenJob, RenderTooLate
+from mec_server.session import DecodeJob, OpenJob, PrepareJob, RenderTooLate
+from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.splice import PictureDecoder
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.prediction import Prediction
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason, RfedgeError
-from rfcore.field import CodecPictureRenderer, Renderer
+from rfcore.field import CodecPictureRenderer, Quality, Renderer
 from rfcore.image import I420
 from rfcore.native.yuv import field_view_from_view
 from rfcore.views import FieldView, View
@@ -66,6 +70,9 @@ class Reconstruction:
 class Decoder(Protocol):
     """Reconstructs the frames of one camera."""
 
+    def prepare(self, job: PrepareJob) -> None:
+        """Do what can be done before the frame of ``job`` comes; raise ``PacketRejected``."""
+
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
 
@@ -74,6 +81,26 @@ class Decoder(Protocol):
 
 
 OpenCameras = Callable[[OpenJob, FieldSource, Tools], dict[str, Decoder]]
+
+
+@dataclass(frozen=True)
+class Place:
+    """All that a render depends on; ``camera`` is None while it is lost."""
+
+    camera: Camera | None
+    field_id: str
+    quality: Quality
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What was made for the next frame before it came, in ``took_ns``."""
+
+    place: Place
+    render: View | None
+    view: FieldView
+    prediction: Prediction
+    took_ns: int
 
 
 class CameraDecoder:
@@ -91,10 +118,27 @@ class CameraDecoder:
         self._clock_ns = tools.clock_ns
         self._decoder = DeltaDecoder(camera.codec, exact, tools.clock_ns, tools.open_decoder)
         self._state = self._decoder.start()
+        self._before: DeltaPacket | None = None
+        self._prepared: Prepared | None = None
 
     def close(self) -> None:
         """Close the decoder; waits for a frame that is being decoded."""
         self._decoder.close()
+
+    def prepare(self, job: PrepareJob) -> None:
+        """Render where the next frame was taken, and make the references that the last one had.
+
+        Raises ``PacketRejected`` for a pose that cannot be rendered. What was prepared before is
+        dropped.
+        """
+        started_ns, self._prepared = self._clock_ns(), None
+        if job.ahead.pose is None:
+            return
+        camera = Camera(self._camera.intrinsics, job.ahead.pose)
+        place = Place(camera, job.field_id, job.ahead.quality)
+        render, view = self._render(place)
+        made = self._decoder.prepared(self._state, view, job.ahead.base_digest, self._before)
+        self._prepared = Prepared(place, render, view, made, self._clock_ns() - started_ns)
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
@@ -105,27 +149,34 @@ class CameraDecoder:
 
     def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         started_ns = self._clock_ns()
-        render, view = self._render(job)
+        ahead, self._prepared = self._prepared, None
+        camera = job.frame.camera(self._camera.intrinsics)
+        place = Place(camera, job.field_id, job.frame.quality)
+        if ahead is not None and ahead.place != place:
+            ahead = None
+        render, view = self._render(place) if ahead is None else (ahead.render, ahead.view)
         rendered_ns = self._clock_ns()
-        decoded = self._decoder.decode_checked(self._state, job.packet, view)
-        self._state = decoded.state
+        made = None if ahead is None else ahead.prediction
+        decoded = self._decoder.decode_checked(self._state, job.packet, view, made)
+        self._state, self._before = decoded.state, job.packet.packet
         times = StageTimes(
             render_ns=rendered_ns - started_ns,
             splice_ns=decoded.stage_ns.get("splice", 0),
             decode_ns=decoded.stage_ns.get("decode", 0),
+            ahead_ns=0 if ahead is None else ahead.took_ns,
         )
         digest = decoded.state.kept[0].digest
         return Reconstruction(decoded.frame, digest, times, decoded.exact, render)
 
-    def _render(self, job: DecodeJob) -> tuple[View | None, FieldView]:
-        """Return the field's view at the frame's pose, and its form for the codec.
+    def _render(self, place: Place) -> tuple[View | None, FieldView]:
+        """Return the field's view there, and its form for the codec.
 
         The view is None where only a device has it, and where the camera is lost.
         """
-        camera = job.frame.camera(self._camera.intrinsics)
+        camera, quality = place.camera, place.quality
         if camera is None:
             return None, FieldView.nothing(self._camera.intrinsics)
-        renderer, quality = self._renderers[job.field_id], job.frame.quality
+        renderer = self._renderers[place.field_id]
         try:
             if isinstance(renderer, CodecPictureRenderer) and renderer.is_on_device:
                 return None, renderer.field_view(camera, quality)
@@ -257,6 +308,23 @@ class StreamDecoders:
         workers = self._parts.background if in_background else self._parts.workers
         workers.submit(self._owner, partial(self._reconstruct, job, expected_s), done)
 
+    @property
+    def has_room(self) -> bool:
+        """Whether a worker is free for what is not urgent."""
+        return self._parts.workers.has_room
+
+    def prepare(
+        self, job: PrepareJob, finished: Callable[[PrepareJob, float | Exception], None]
+    ) -> None:
+        """Prepare for a frame on a worker, then call ``finished`` on the loop with the seconds for
+        which that kept the worker busy, or an unexpected exception; never after ``close``."""
+
+        def done(outcome: float | Exception) -> None:
+            if not self._closed:
+                finished(job, outcome)
+
+        self._parts.workers.submit(self._owner, partial(self._prepare, job), done)
+
     def close(self) -> None:
         """Close the decoders on threads, those that are still being opened included."""
         self._closed = True
@@ -328,6 +396,15 @@ class StreamDecoders:
         if self._recording is not None:
             self._recording.save(job.frame, job.field_id, reconstruction.picture)
         return reconstruction, worker_s
+
+    def _prepare(self, job: PrepareJob) -> float:
+        """Return for how long it kept the worker busy; a pose that cannot be rendered is refused
+        with its frame."""
+        started_s = time.perf_counter()
+        if not self._closed:
+            with suppress(PacketRejected):
+                self._decoders[job.ahead.camera_id].prepare(job)
+        return time.perf_counter() - started_s
 
     def _check_deadline(self, job: DecodeJob, expected_s: float) -> None:
         waited_s = time.monotonic() - job.received_s

@@ -43,6 +43,7 @@ from rfcore.wire.messages import (
     FrameAddress,
     Hello,
     Nack,
+    PoseAhead,
     RendererContract,
     ServerMessage,
     StageTimes,
@@ -77,6 +78,14 @@ class DecodeJob:
     field_id: str
     received_s: float
     started_s: float
+
+
+@dataclass(frozen=True)
+class PrepareJob:
+    """Make what the next frame of a camera will be predicted from."""
+
+    ahead: PoseAhead
+    field_id: str
 
 
 @dataclass(frozen=True)
@@ -151,6 +160,8 @@ class ServerSession:
             self._receive_hello(message)
         elif isinstance(message, Frame):
             self._receive_frame(message, now)
+        else:
+            self._receive_ahead(message, now)
 
     def refuse(self, error: InvalidInput | FrameRefused, now: float) -> None:
         """Answer for a message that failed its checks; the session lives on."""
@@ -222,6 +233,16 @@ class ServerSession:
         except PacketRejected as error:
             self._refuse(frame.address, error.reason, error.problem, now)
 
+    def _receive_ahead(self, ahead: PoseAhead, now: float) -> None:
+        """Take a pose ahead of its frame; before Welcome, and while draining, it is of no use."""
+        self._restart_deadline(now)
+        if self.state is SessionState.OPEN:
+            self._cameras.queue_of(ahead).expect(self._cameras.posed(ahead))
+
+    def refuse_ahead(self) -> None:
+        """Note that a pose ahead failed its checks: it has no answer, its frame will be refused."""
+        self._unusable_frame()
+
     # --- numerical work
 
     def jobs_to_start(self, now: float) -> list[OpenJob | DecodeJob]:
@@ -236,7 +257,7 @@ class ServerSession:
         for queue, waiting in self._cameras.started():
             frame = waiting.frame
             try:
-                packet = queue.check(frame)
+                packet = CheckedPacket(frame.packet, queue.check(frame))
             except PacketRejected as error:
                 queue.fail()
                 self._nack(frame.address, error.reason, error.problem)
@@ -246,6 +267,21 @@ class ServerSession:
                 jobs.append(DecodeJob(frame, packet, field_id, waiting.received_s, now))
         self._finish_draining()
         return jobs
+
+    def poses_to_prepare(self) -> list[PrepareJob]:
+        """Return the work that can be done before the frames of these poses come.
+
+        Only a server with a worker to spare asks for it. A camera's next frame waits for it, until
+        ``prepared``.
+        """
+        return [
+            PrepareJob(ahead, self._cameras.field_of(ahead))
+            for _, ahead in self._cameras.to_prepare()
+        ]
+
+    def prepared(self, job: PrepareJob) -> None:
+        """Note that a pose was prepared, or could not be: its frame will tell."""
+        self._cameras.queue_of(job.ahead).prepared()
 
     def opened(self, job: OpenJob, now: float) -> None:
         """Fields and decoders of ``job`` are ready."""
@@ -296,6 +332,7 @@ class ServerSession:
             splice_ns=times.splice_ns,
             decode_ns=times.decode_ns,
             total_ns=_ns(now - job.received_s),
+            ahead_ns=times.ahead_ns,
         )
         self._say(Ack(address, times, digest[:RECONSTRUCTION_DIGEST_BYTES]))
         self._answered(now)

@@ -29,6 +29,7 @@ from mec_server.reconstruction import DecodingParts, Reconstruction, StreamDecod
 from mec_server.session import (
     DecodeJob,
     OpenJob,
+    PrepareJob,
     RenderTooLate,
     ServerSession,
     SessionState,
@@ -39,7 +40,7 @@ from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, ProtocolError, RfedgeError
 from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.convert import client_message_from_bytes
-from rfcore.wire.convert_answers import server_messages_to_bytes
+from rfcore.wire.convert_answers import AnswerWriter
 from rfcore.wire.head import FrameReader, FrameRefused
 from rfcore.wire.messages import (
     Frame,
@@ -112,6 +113,7 @@ class Stream:
         self._decoders = StreamDecoders(server.decoding, session_id)
         self._intrinsics: dict[str, Intrinsics] = {}
         self._reader: FrameReader | None = None
+        self._writer = AnswerWriter()
         self._fault: Exception | None = None
         self._metrics = server.metrics.of(UNKNOWN_VEHICLE)
         self._peer = context.peer()
@@ -224,11 +226,15 @@ class Stream:
         now = time.monotonic()
         for job in self._session.jobs_to_start(now):
             if isinstance(job, DecodeJob):
-                expected_s, doubtful = self._account.expected_s(), self._account.is_doubtful(now)
+                expected_s = self._account.expected_s(job.frame.camera_id)
+                doubtful = self._account.is_doubtful(now)
                 self._decoders.submit(job, expected_s, self._finished, in_background=doubtful)
                 self._expect(job)
             else:
                 self._opening = self._tasks.create_task(self._open(job))
+        if self._decoders.has_room and not self._account.is_doubtful(now):
+            for ahead in self._session.poses_to_prepare():
+                self._decoders.prepare(ahead, self._prepared)
         if self._session.has_news:
             self._wake.set()
 
@@ -237,7 +243,7 @@ class Stream:
         if not messages or self.is_stalled:
             return
         self._metrics.answered(messages)
-        for data in server_messages_to_bytes(messages):
+        for data in self._writer.messages(messages):
             self._writing_since_s = time.monotonic()
             await self._context.write(data)
         self._writing_since_s = None
@@ -285,10 +291,7 @@ class Stream:
         excess = self._excess(lambda: self._account.spend_message(len(data), now))
         try:
             message = client_message_from_bytes(data)
-            frame = None if isinstance(message, Hello) else self._frame(message)
-        except FrameRefused as error:
-            self._log_rejected(error.address, error)
-            self._session.refuse(error, now)
+            frame = None if isinstance(message, Hello) else self._frame(message, now)
         except InvalidInput as error:
             self._log.warning("message refused", problem=str(error))
             self._session.refuse(error, now)
@@ -299,11 +302,23 @@ class Stream:
                 self._receive_hello(message, excess, now)
             elif isinstance(frame, Frame):
                 self._receive_frame(frame, len(data), excess, now)
+            elif frame is not None:
+                self._receive_ahead(frame, len(data), excess, now)
 
-    def _frame(self, packed: PackedFrame) -> Frame | PoseAhead:
+    def _frame(self, packed: PackedFrame, now: float) -> Frame | PoseAhead | None:
+        """Return what was packed; None if it is refused. A pose ahead is never answered."""
         if self._reader is None:
             raise ProtocolError("a frame came before Hello")
-        return self._reader.read(packed)
+        try:
+            return self._reader.read(packed)
+        except FrameRefused as error:
+            self._log_rejected(error.address, error, "pose ahead" if packed.is_ahead else "frame")
+            if packed.is_ahead:
+                self._server.metrics.poses_ahead.labels("refused").inc()
+                self._session.refuse_ahead()
+            else:
+                self._session.refuse(error, now)
+            return None
 
     def _excess(self, spend: Callable[[], None]) -> LimitExceeded | None:
         """Return the limit that ``spend`` exceeds, if it does: counted, and logged once."""
@@ -327,6 +342,7 @@ class Stream:
         if session.state is not SessionState.OPENING:
             return
         self._reader = FrameReader(hello)
+        self._writer = AnswerWriter(camera.camera_id for camera in hello.cameras)
         try:
             rate_hz = self._account.enter(hello, self, now)
         except LimitExceeded as error:
@@ -352,6 +368,16 @@ class Stream:
         self._over_budget = False
         self._session.receive(frame, now)
 
+    def _receive_ahead(
+        self, ahead: PoseAhead, message_bytes: int, excess: LimitExceeded | None, now: float
+    ) -> None:
+        """Take a pose ahead of its frame; one beyond a budget is not prepared for."""
+        self._metrics.received_ahead(message_bytes)
+        if excess is None:
+            excess = self._excess(lambda: self._account.spend_ahead(ahead, message_bytes, now))
+        if excess is None:
+            self._session.receive(ahead, now)
+
     async def _open(self, job: OpenJob) -> None:
         try:
             await self._decoders.open(self._account.identity, job, self._account.take_decoders())
@@ -374,6 +400,16 @@ class Stream:
 
     # --- outcomes of frames, on the event loop
 
+    def _prepared(self, job: PrepareJob, outcome: float | Exception) -> None:
+        if isinstance(outcome, Exception):
+            self._fault = outcome
+            self._wake.set()
+            return
+        self._account.prepared(job.ahead.camera_id, outcome, time.monotonic())
+        self._server.metrics.poses_prepared.inc()
+        self._session.prepared(job)
+        self._advance()
+
     def _finished(
         self, job: DecodeJob, outcome: Reconstruction | Exception, worker_s: float
     ) -> None:
@@ -391,7 +427,9 @@ class Stream:
         if isinstance(outcome, Exception) and not isinstance(outcome, PacketRejected):
             raise outcome
         is_complete = isinstance(outcome, Reconstruction)
-        self._account.worked(job.field_id, worker_s, now, complete=is_complete)
+        worker_s = self._account.worked(
+            job.frame.camera_id, job.field_id, worker_s, now, complete=is_complete
+        )
         changed = self._server.entry.reallocate_rates(now)
         if changed:
             self._regrant(changed)
@@ -434,9 +472,11 @@ class Stream:
         except LimitExceeded as barred:
             self._session.end(barred)
 
-    def _log_rejected(self, address: FrameAddress, error: PacketRejected) -> None:
+    def _log_rejected(
+        self, address: FrameAddress, error: PacketRejected, what: str = "frame"
+    ) -> None:
         self._log.warning(
-            "frame rejected",
+            f"{what} rejected",
             camera=address.camera_id,
             epoch=address.epoch,
             seq=address.sequence,
@@ -459,6 +499,7 @@ class Stream:
             reconstructed_s=now,
             latency_s=latency_s,
             opened_time_ns=self._opened_time_ns,
+            decoding_s=now - job.received_s,
         )
         self._server.twin.show(picture, made.render)
         if self._server.trials is not None and not hello.allow_recording:

@@ -70,6 +70,7 @@ class PictureFolder:
             "capture_time_ns": picture.capture_time_ns,
             "instant": picture.instant or None,
             "age_ms": picture.age_ns / 1e6,
+            "decoding_ms": picture.decoding_ns / 1e6,
             "translation_m": None if picture.pose is None else picture.pose.translation_m,
             "rotation_wxyz": None if picture.pose is None else picture.pose.rotation,
             "field": picture.field_id,
@@ -300,6 +301,7 @@ def _line(message: TwinPicture | Departure) -> str:
     instant = f"instant {message.instant}  " if message.instant else ""
     return (
         f"{message.vehicle_id}/{message.camera_id} {message.epoch}:{message.sequence:<6} {instant}"
-        f"age {message.age_ns / 1e6:6.1f} ms  {where}  "
+        f"age {message.age_ns / 1e6:6.1f} ms, {message.decoding_ns / 1e6:.1f} since its last "
+        f"byte  {where}  "
         f"{len(message.picture)} bytes  missed {message.skipped}"
     )

@@ -11,10 +11,10 @@ from typing import Any
 import grpc
 
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
-from mec_server.session import DecodeJob, OpenJob
+from mec_server.session import DecodeJob, OpenJob, PrepareJob
 from rfcore.wire.conventions import CHANNEL_OPTIONS, CONSUMER_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import hello_to_bytes
-from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.convert_answers import AnswerReader
 from rfcore.wire.messages import Hello, Welcome
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import Subscription, subscription_to_wire
@@ -83,7 +83,7 @@ async def open_stream(channel: grpc.aio.Channel, hello: Hello, metadata: Any = (
     """Open a vehicle's stream and expect its Welcome."""
     stream = channel.stream_stream(STREAM_METHOD)(metadata=metadata)
     await stream.write(hello_to_bytes(hello))
-    (welcome, *_) = server_messages_from_bytes(await stream.read())
+    (welcome, *_) = AnswerReader().messages(await stream.read())
     assert isinstance(welcome, Welcome)
     return stream
 
@@ -109,6 +109,9 @@ class WatchedDecoder:
     def __init__(self, decoder: Decoder, before: Callable[[DecodeJob], None]) -> None:
         self._decoder = decoder
         self._before = before
+
+    def prepare(self, job: PrepareJob) -> None:
+        self._decoder.prepare(job)
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         self._before(job)

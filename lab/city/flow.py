@@ -36,7 +36,7 @@ from mec_server.config import SessionLimits
 from mec_server.ledger.promises import HEADROOM
 from rfcore.codec.packet import RECONSTRUCTION_DIGEST_BYTES
 from rfcore.errors import InvalidInput
-from rfcore.wire.convert_answers import server_messages_to_bytes
+from rfcore.wire.convert_answers import AnswerWriter
 from rfcore.wire.messages import Ack, Credit, FrameAddress, StageTimes
 from rfedge.sizing.estimate import estimate, nearest_cell
 from rfedge.sizing.tables import SizingTables
@@ -123,9 +123,9 @@ def costs_of(city: City, tables: SizingTables) -> Costs:
 
 def answer_bytes() -> int:
     """Return the bytes of the messages that answer a frame: an Ack and a Credit."""
-    times = StageTimes(*[10**7] * 5)
+    times = StageTimes(*[10**7] * 6)
     ack = Ack(FrameAddress("front", 0, LARGEST_ID), times, bytes(RECONSTRUCTION_DIGEST_BYTES))
-    return sum(map(len, server_messages_to_bytes([ack, Credit("front", LARGEST_ID)])))
+    return sum(map(len, AnswerWriter(["front"]).messages([ack, Credit("front", LARGEST_ID)])))
 
 
 @dataclass(frozen=True, eq=False)

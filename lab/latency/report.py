@@ -89,6 +89,8 @@ class ShownRow:
     sender_busy_percent: float
     """Share of the time that one core of the vehicle computes."""
     receiver_busy_percent: float
+    pose_ahead: bool = False
+    """Poses were sent ahead of their frames."""
 
 
 def sender_of(row: NeededRow | PlayedRow | ShownRow) -> str:
@@ -100,6 +102,7 @@ CDF_RATE_BPS = 4e6
 """The rate whose distribution is drawn: the demo's link."""
 
 SENDER = Column("sender", sender_of)
+AHEAD = Column("pose ahead", lambda row: "yes" if row.pose_ahead else "")
 WITHIN_5 = Column(
     "uplink for 99 % within 5 ms, Mbit/s", lambda row: row.uplink_bps_p99_within["5"] / 1e6, ".2f"
 )
@@ -134,7 +137,7 @@ def latency_parts(result: Result) -> Iterator[Table | str]:
         "as that frame took when it was measured, and frames wait for it; a vehicle codes the "
         "newest picture, and older ones are dropped."
     )
-    seen = columns(ShownRow, "link", SENDER, SHOWN_P50, SHOWN_P99, DROPPED, IN_TIME)
+    seen = columns(ShownRow, "link", SENDER, AHEAD, SHOWN_P50, SHOWN_P99, DROPPED, IN_TIME)
     yield Table("From capture to shown", seen, rows_of(ShownRow, result["shown"]))
 
 

@@ -9,10 +9,11 @@ that is dropped before it is coded counts as late.
 message's own transmission time; the network latency adds waiting behind earlier frames and the
 link's propagation. A frame that finds too many under way is dropped.
 
-``show``: from capture to shown. Either end works at one frame at a time, for as long as that very
-frame took when it was measured, and frames wait for it: a mean would hide what a slow frame does to
-those behind it. A vehicle begins with the newest frame that was captured, and older ones are
-dropped; it hears that a frame is shown after the link's delay.
+``show``: from capture to shown, with the pose ahead of its frame and without. Either end works at
+one frame at a time, for as long as that very frame took when it was measured, and frames wait for
+it: a mean would hide what a slow frame does to those behind it. A vehicle begins with the newest
+frame that was captured, and older ones are dropped; it hears that a frame is shown after the link's
+delay.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
 from typing import Any, TypeVar
@@ -66,6 +67,17 @@ class FrameWork:
 
     size_bytes: int
     sender_ms: float
+    receiver_ms: float
+    ahead: AheadWork | None = None
+
+
+@dataclass(frozen=True)
+class AheadWork:
+    """What a pose ahead of a frame changes: its bytes on the link, the sender's time until it is
+    known, and the receiver's that needs nothing else."""
+
+    size_bytes: int
+    located_ms: float
     receiver_ms: float
 
 
@@ -128,11 +140,20 @@ def show(frames: Sequence[FrameWork], rate_hz: float, link: DirectionPlan) -> Sh
     while next_frame < len(frames):
         begin_s = max(next_frame / rate_hz, sender_free_s, heard_s[-WINDOW])
         newest = min(len(frames) - 1, int(begin_s * rate_hz + CAPTURED))
-        work = frames[newest]
+        work, receiver_ms = frames[newest], frames[newest].receiver_ms
+        ahead, begun_s = work.ahead, math.inf
+        if ahead is not None:
+            located_s = begin_s + ahead.located_ms / 1e3
+            machine.pop_due(located_s)
+            pose_s = machine.push(-1 - newest, ahead.size_bytes, located_s).due_s
+            begun_s = max(pose_s, receiver_free_s)
         sender_free_s = begin_s + work.sender_ms / 1e3
         machine.pop_due(sender_free_s)
         arrived_s = machine.push(newest, work.size_bytes, sender_free_s).due_s
-        receiver_free_s = max(arrived_s, receiver_free_s) + work.receiver_ms / 1e3
+        if ahead is not None and begun_s < arrived_s:  # else the frame finds nothing begun
+            receiver_free_s = begun_s + ahead.receiver_ms / 1e3
+            receiver_ms -= ahead.receiver_ms
+        receiver_free_s = max(arrived_s, receiver_free_s) + receiver_ms / 1e3
         heard_s.append(receiver_free_s + answer_s)
         latency_ms.append(1e3 * (receiver_free_s - newest / rate_hz))
         sent.append(work)
@@ -207,8 +228,11 @@ TIMED = 3
 """
 
 
-EndsMs = list[tuple[float, float]]
-"""Processor time of each frame at the sender and at the receiver."""
+EndsMs = list[tuple[float, ...]]
+"""Processor time of each frame at the sender and at the receiver; ours with all of
+``FrameTimes``."""
+AHEAD_BYTES = 15
+"""A pose ahead as a message, usually."""
 
 
 @dataclass(frozen=True)
@@ -247,7 +271,13 @@ def run_latency(job: EvalLatency, console: Console) -> dict[str, Any]:
     senders = [s for name in names for s in _senders(job, name, field, run)]
     run.tell(f"coded in {monotonic() - began_s:.0f} s")
     rows = [_row(sender, name, plan) for sender in senders for name, plan in links]
-    shown = [_shown(sender, name, plan) for sender in senders for name, plan in links]
+    slow = ("4 Mbit/s, 20 ms", DirectionPlan(LinkProfile(4e6, delay_s=0.02)))
+    shown = [
+        row
+        for sender in senders
+        for name, plan in (*links, slow)
+        for row in _shown(sender, name, plan)
+    ]
     content = {
         "field_id": field.field_id,
         "field_psnr_db": {s.clip.scene: s.clip.field_psnr_db for s in senders},
@@ -304,15 +334,17 @@ def _own_times(
     return ours, _least(ends_ms for _, ends_ms in measured)
 
 
-def _least(measured: Iterable[EndsMs]) -> EndsMs:
+def _least(measured: Iterable[Sequence[tuple[float, ...]]]) -> EndsMs:
     """Return, frame by frame, the least that either end took."""
-    least = np.min(np.array(list(measured)), axis=0)
-    return [(sender_ms, receiver_ms) for sender_ms, receiver_ms in least.tolist()]
+    return list(map(tuple, np.min(np.array(list(measured)), axis=0).tolist()))
 
 
 def _work(coded: CodedClip, ends_ms: EndsMs) -> list[FrameWork]:
     sizes = coded.frame_bytes.tolist()
-    return [FrameWork(size, *ms) for size, ms in zip(sizes, ends_ms, strict=True)]
+    return [
+        FrameWork(size, ms[0], ms[1], AheadWork(AHEAD_BYTES, ms[2], ms[3]) if ms[2:] else None)
+        for size, ms in zip(sizes, ends_ms, strict=True)
+    ]
 
 
 def at_quality(clip: Clip, coder: ClipCoder, quality_db: float, store: CellStore) -> CodedClip:
@@ -344,8 +376,18 @@ def _row(sender: Sender, name: str, plan: DirectionPlan) -> PlayedRow:
     )
 
 
-def _shown(sender: Sender, name: str, plan: DirectionPlan) -> ShownRow:
-    shown = show(repeated(sender.work, PLAYED_FRAMES), sender.clip.rate_hz, plan)
+def _shown(sender: Sender, name: str, plan: DirectionPlan) -> Iterator[ShownRow]:
+    """Yield the row of a link; of ours one without poses ahead and one with them."""
+    plain = [replace(work, ahead=None) for work in sender.work]
+    yield _shown_row(sender, plain, name, plan)
+    if plain != list(sender.work):
+        yield _shown_row(sender, sender.work, name, plan)
+
+
+def _shown_row(
+    sender: Sender, work: Sequence[FrameWork], name: str, plan: DirectionPlan
+) -> ShownRow:
+    shown = show(repeated(work, PLAYED_FRAMES), sender.clip.rate_hz, plan)
     width_px, height_px = sender.clip.frames[0].size_px
     return ShownRow(
         **sender.facts,
@@ -361,6 +403,7 @@ def _shown(sender: Sender, name: str, plan: DirectionPlan) -> ShownRow:
         share_within={f"{ms:g}": shown.share_within(ms) for ms in SHOWN_WITHIN_MS},
         sender_busy_percent=100 * shown.sender_busy,
         receiver_busy_percent=100 * shown.receiver_busy,
+        pose_ahead=work[0].ahead is not None,
     )
 
 

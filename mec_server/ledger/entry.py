@@ -15,7 +15,7 @@ from mec_server.ledger.budgets import Budget, Limit, Resource, decoders_of
 from mec_server.ledger.ledger import Hold, Ledger, TokenBucket
 from mec_server.ledger.promises import ASSUMED_HZ, Promises
 from rfcore.errors import LimitExceeded
-from rfcore.wire.messages import Frame, Hello
+from rfcore.wire.messages import Frame, Hello, PoseAhead
 
 CAMERA_SILENT_S = 3.0
 """Silence after which another agent may take a camera over: by then the stream's own keepalive (2 s
@@ -167,6 +167,8 @@ class StreamAccount:
         self._session_id = session_id
         self._named = named
         self._cameras: dict[str, CameraMeter] = {}
+        self._aheads: dict[str, CameraMeter] = {}
+        self._unclaimed_s: dict[str, float] = {}
         self._granted: list[Callable[[], None]] = []
         self._decoders: Hold | None = None
         self._is_unpaid = False
@@ -198,19 +200,22 @@ class StreamAccount:
         except LimitExceeded:
             self.leave()
             raise
-        self._cameras = {
-            camera.camera_id: CameraMeter(
-                camera.intrinsics.width_px * camera.intrinsics.height_px,
-                rate_hz or max(UNSTATED_HZ, camera.rate_hz),
-                now,
-            )
-            for camera in hello.cameras
-        }
+        self._cameras, self._aheads = (
+            {
+                camera.camera_id: CameraMeter(
+                    camera.intrinsics.width_px * camera.intrinsics.height_px,
+                    rate_hz or max(UNSTATED_HZ, camera.rate_hz),
+                    now,
+                )
+                for camera in hello.cameras
+            }
+            for _ in range(2)
+        )
         return rate_hz
 
     def grant(self, rate_hz: float, now: float) -> None:
         """Let each camera send ``rate_hz`` pictures per second from now on."""
-        for camera in self._cameras.values():
+        for camera in (*self._cameras.values(), *self._aheads.values()):
             camera.grant(rate_hz, now)
 
     def spend_message(self, message_bytes: int, now: float) -> None:
@@ -225,7 +230,13 @@ class StreamAccount:
         An identity that kept workers busy for longer than its share, or for long with frames that
         were rejected, waits until that is made up for, unless it is alone.
         """
-        camera = self._cameras.get(frame.camera_id)
+        self._spend(self._cameras.get(frame.camera_id), message_bytes, now)
+
+    def spend_ahead(self, ahead: PoseAhead, message_bytes: int, now: float) -> None:
+        """Count a pose ahead of its frame, as often as frames may come; raise ``LimitExceeded``."""
+        self._spend(self._aheads.get(ahead.camera_id), message_bytes, now)
+
+    def _spend(self, camera: CameraMeter | None, message_bytes: int, now: float) -> None:
         if camera is not None:
             camera.spend(message_bytes, now)
         if self._entry.promises.is_crowded:
@@ -236,19 +247,44 @@ class StreamAccount:
         """Return whether work for this identity came to nothing lately (``Ledger.is_doubtful``)."""
         return self._entry.ledger.is_doubtful(self.identity, now)
 
-    def expected_s(self) -> float:
-        """Return how long the next frame will keep a worker busy."""
-        return self._entry.promises.expected_s(self._session_id)
+    def expected_s(self, camera_id: str) -> float:
+        """Return how long the next frame of a camera will keep a worker busy."""
+        expected_s = self._entry.promises.expected_s(self._session_id)
+        return max(0.0, expected_s - self._unclaimed_s.get(camera_id, 0.0))
 
-    def worked(self, field_id: str, worker_s: float, now: float, *, complete: bool = True) -> None:
-        """Charge the time for which a frame kept a worker busy; ``complete``: it was not
-        rejected."""
-        self._entry.promises.worked(self._session_id, field_id, worker_s, complete=complete)
-        lent = not self._entry.promises.is_crowded
-        self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now, lent=lent)
+    def prepared(self, camera_id: str, worker_s: float, now: float) -> None:
+        """Charge the time for which a frame that is to come kept a worker busy.
+
+        What was done before for a frame that did not come counts as rejected.
+        """
+        self.rejected(self._unclaimed_s.get(camera_id, 0.0), now)
+        self._unclaimed_s[camera_id] = worker_s
+        self._charge_work(worker_s, now)
+
+    def worked(
+        self,
+        camera_id: str,
+        field_id: str,
+        worker_s: float,
+        now: float,
+        *,
+        complete: bool = True,
+    ) -> float:
+        """Charge the time for which a frame kept a worker busy; ``complete``: it was not rejected.
+
+        Returns that time with what was done before it came.
+        """
+        whole_s = worker_s + self._unclaimed_s.pop(camera_id, 0.0)
+        self._entry.promises.worked(self._session_id, field_id, whole_s, complete=complete)
+        self._charge_work(worker_s, now)
         if complete:
             self._is_unpaid = False
             self._entry.ledger.opening_paid(self.identity, now)
+        return whole_s
+
+    def _charge_work(self, worker_s: float, now: float) -> None:
+        lent = not self._entry.promises.is_crowded
+        self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now, lent=lent)
 
     def rejected(self, worker_s: float, now: float) -> None:
         """Charge the time for which a frame kept a worker busy that is itself to blame for its
@@ -263,6 +299,8 @@ class StreamAccount:
 
     def ended(self, now: float) -> None:
         """Note that the stream is over; decoders that never gave a picture were for nothing."""
+        self.rejected(sum(self._unclaimed_s.values()), now)
+        self._unclaimed_s.clear()
         if self._is_unpaid:
             self.opening_failed(now)
 
@@ -282,7 +320,7 @@ class StreamAccount:
     def leave(self) -> None:
         """Give back what Hello was granted: decoders, promised time, cameras."""
         granted, self._granted = self._granted, []
-        self._cameras = {}
+        self._cameras, self._aheads = {}, {}
         for give_back in reversed(granted):
             give_back()
 

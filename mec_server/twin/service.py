@@ -464,6 +464,7 @@ def picture_message(
         clock=picture.frame.clock,
         localisation=picture.frame.localisation,
         instant=picture.frame.instant,
+        decoding_ns=round(picture.decoding_s * 1e9),
     )
 
 

@@ -44,6 +44,7 @@ Covers = Callable[[str, str], bool]
 class ReceivedPicture:
     """A reconstructed picture, ``latency_s`` old at ``reconstructed_s`` (monotonic).
 
+    ``decoding_s``: from the last byte of its frame.
     ``opened_time_ns``: when its session's Hello arrived, Unix time of this server.
     """
 
@@ -57,6 +58,7 @@ class ReceivedPicture:
     reconstructed_s: float
     latency_s: float
     opened_time_ns: int = 0
+    decoding_s: float = 0.0
 
     @property
     def key(self) -> CameraKey:

@@ -94,10 +94,31 @@ class DeltaDecoder:
         checked = check_packet(packet, state.epoch, state.next_sequence)
         return self.decode_checked(state, checked, view)
 
+    def prepared(
+        self, state: DecoderState, view: FieldView, base_digest: bytes, like: DeltaPacket | None
+    ) -> Prediction:
+        """Return what the next packet is predicted from, if it is like ``like``, the one before.
+
+        ``base_digest`` names the earlier frame. The references that ``like`` had are made.
+        """
+        past = state.past(base_digest) if base_digest and self._exact else None
+        if like is None or past is None or like.photometric or like.light:
+            return Prediction(view)
+        prediction = Prediction.relit(view, past) if like.relit else Prediction(view, past)
+        prediction.pictures(like.references)
+        return prediction
+
     def decode_checked(
-        self, state: DecoderState, checked: CheckedPacket, view: FieldView
+        self,
+        state: DecoderState,
+        checked: CheckedPacket,
+        view: FieldView,
+        prepared: Prediction | None = None,
     ) -> Decoded:
-        """Decode as ``decode`` does, for a caller that checked the packet before it rendered."""
+        """Decode as ``decode`` does, for a caller that checked the packet before it rendered.
+
+        ``prepared``: made from the same view, used if the packet is predicted from that.
+        """
         packet = checked.packet
         render = view.render
         if render.size_px != self._config.size_px:
@@ -108,7 +129,11 @@ class DeltaDecoder:
         try:
             past = self._past(state, packet)
             self._check_payload(packet)
-            prediction = prediction_of(packet, view, past)
+            prediction = (
+                prepared
+                if prepared is not None and _fits(prepared, packet, past)
+                else (prediction_of(packet, view, past))
+            )
             pictures = _pictures(packet, prediction)
             made_ns = self._clock_ns()
             spliced_ns, frame = self._reconstruct(packet, pictures)
@@ -207,6 +232,13 @@ class DeltaDecoder:
             return spliced_ns, self._splice.decode(packet.payload)
         except CodecError as error:
             raise PacketRejected(RejectReason.DECODER_FAILED, str(error)) from error
+
+
+def _fits(prepared: Prediction, packet: DeltaPacket, past: Past | None) -> bool:
+    """Return whether a packet, of the same view, is predicted from what was prepared."""
+    lights = (prepared.photometric, prepared.is_relit, prepared.light)
+    same_light = lights == (packet.photometric, packet.relit, packet.light)
+    return same_light and (past is None or past is prepared.past)
 
 
 def prediction_of(packet: DeltaPacket, view: FieldView, past: Past | None) -> Prediction:

@@ -146,20 +146,27 @@ class CheckedPacket:
 def check_packet(packet: DeltaPacket, epoch: int, next_sequence: int) -> CheckedPacket:
     """Check a packet where ``next_sequence`` of ``epoch`` is the lowest that may come.
 
+    Raises ``PacketRejected`` as ``check_order``.
+    """
+    lost = check_order(packet.epoch, packet.sequence, epoch, next_sequence)
+    return CheckedPacket(packet, lost)
+
+
+def check_order(epoch: int, sequence: int, current: int, next_sequence: int) -> int:
+    """Return how many packets are missing right before ``sequence`` of ``epoch``, where
+    ``next_sequence`` of the epoch ``current`` is the lowest that may come.
+
     A higher epoch is a new start, whose sequences count from 0. Raises ``PacketRejected`` with
     STALE_EPOCH or STALE_SEQUENCE for a packet that comes too late.
     """
-    if packet.epoch < epoch:
+    if epoch < current:
+        raise PacketRejected(RejectReason.STALE_EPOCH, f"epoch {epoch} where {current} is current")
+    lowest = next_sequence if epoch == current else 0
+    if sequence < lowest:
         raise PacketRejected(
-            RejectReason.STALE_EPOCH, f"epoch {packet.epoch} where {epoch} is current"
+            RejectReason.STALE_SEQUENCE, f"sequence {sequence} where {lowest} or later is expected"
         )
-    lowest = next_sequence if packet.epoch == epoch else 0
-    if packet.sequence < lowest:
-        raise PacketRejected(
-            RejectReason.STALE_SEQUENCE,
-            f"sequence {packet.sequence} where {lowest} or later is expected",
-        )
-    return CheckedPacket(packet, packet.sequence - lowest)
+    return sequence - lowest
 
 
 def _require_number(name: str, value: int, limit: int) -> None:

@@ -38,6 +38,8 @@ def refusing(address: FrameAddress) -> Iterator[None]:
         yield
     except InvalidInput as error:
         raise FrameRefused(RejectReason.INVALID_ARGUMENT, str(error), address) from error
+    except FrameRefused:
+        raise
     except PacketRejected as error:
         raise FrameRefused(error.reason, error.problem, address) from error
 

@@ -7,6 +7,7 @@ that knows both forms. A value of these types that came through ``convert`` has 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from rfcore.camera import LATTICE, Camera, Intrinsics, Pose, PoseLattice, camera_on_rig
 from rfcore.codec.h264.bitstream import StreamHeader
@@ -23,6 +24,8 @@ from rfcore.wire.values import ClockKind
 MAX_EPOCH_STEP = 1 << 16
 """Largest step from one epoch to the next: a flipped high bit must not make all later ones
 stale."""
+
+AnyPosed = TypeVar("AnyPosed", "Frame", "PoseAhead")
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class CameraDescription:
     rate_hz: float = 0.0
     camera_from_rig: Pose | None = None
 
-    def posed(self, frame: Frame) -> Frame:
+    def posed(self, frame: AnyPosed) -> AnyPosed:
         """Return ``frame`` as it came, with the pose of its camera in place of the rig's."""
         if self.camera_from_rig is None or frame.pose is None:
             return frame
@@ -217,6 +220,9 @@ class StageTimes:
     splice_ns: int = 0
     decode_ns: int = 0
     total_ns: int = 0
+    """From the last byte of the frame to its answer."""
+    ahead_ns: int = 0
+    """Before that, once its pose had come: rendering, warp and correction."""
 
 
 @dataclass(frozen=True)

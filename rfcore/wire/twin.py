@@ -67,7 +67,8 @@ class TwinPicture:
     """One reconstructed picture.
 
     ``pose``: world_from_cam, relative to the tile's origin; None while the vehicle is lost.
-    ``age_ns``: from capture until the server sent it. ``skipped``: pictures of this camera that
+    ``age_ns``: from capture until the server sent it. ``decoding_ns``: from the last byte of its
+    frame until the server had it. ``skipped``: pictures of this camera that
     this consumer has missed. ``payload_bytes``: length of the slice that it was decoded from.
     ``clock``: where a live camera's capture time comes from. ``localisation``: state of a vehicle
     that finds its camera in the field; None if its poses are given. ``instant``: pictures of one
@@ -93,6 +94,7 @@ class TwinPicture:
     clock: ClockKind | None = None
     localisation: LocalisationState | None = None
     instant: int = 0
+    decoding_ns: int = 0
 
     @property
     def key(self) -> CameraKey:

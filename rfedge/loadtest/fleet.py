@@ -27,7 +27,7 @@ from rfcore.errors import ProtocolError
 from rfcore.files import write_whole
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import hello_to_bytes
-from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.convert_answers import AnswerReader
 from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import Hello, Welcome
 from rfcore.wire.notices import StreetNotice
@@ -64,6 +64,7 @@ class PrerecordedVehicle(asyncio.Protocol):
         self._address, self._tls = address, tls
         self._hello = replace(hello, vehicle_id=name)
         writer = FrameWriter(self._hello)
+        self._answers = AnswerReader(camera.camera_id for camera in hello.cameras)
         self.replays = [Replay(c.camera_id, drive, wall_ns, writer) for c in hello.cameras]
         self._call = GrpcCall(address, STREAM_METHOD)
         self._transport: asyncio.Transport | None = None
@@ -157,7 +158,7 @@ class PrerecordedVehicle(asyncio.Protocol):
         self._go_on()
 
     def _take(self, data: bytes, now: float) -> None:
-        for message in server_messages_from_bytes(data):
+        for message in self._answers.messages(data):
             for replay in self.replays:
                 replay.receive(message, now)
             if isinstance(message, StreetNotice):

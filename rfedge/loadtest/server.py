@@ -24,7 +24,7 @@ from mec_server.reconstruction import (
     open_cameras,
 )
 from mec_server.server import serve
-from mec_server.session import DecodeJob, OpenJob
+from mec_server.session import DecodeJob, OpenJob, PrepareJob
 from rfcore.camera import Camera
 from rfcore.field import Quality, Renderer
 from rfcore.image import I420
@@ -42,6 +42,9 @@ class PassingDecoder:
 
     def __init__(self, camera: CameraDescription) -> None:
         self._grey = I420.filled((camera.intrinsics.width_px, camera.intrinsics.height_px))
+
+    def prepare(self, job: PrepareJob) -> None:
+        """Prepare nothing."""
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         """Return grey; the frame's CRC was checked when it was read."""

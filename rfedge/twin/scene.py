@@ -167,6 +167,7 @@ class TwinScene:
             "sequence": picture.sequence,
             "capture_time_ms": picture.capture_time_ns / 1e6,
             "age_ms": picture.age_ns / 1e6,
+            "decoding_ms": picture.decoding_ns / 1e6,
             "field": picture.field_id,
             "origin_m": self._offset_m(picture.field_id),
             "translation_m": picture.pose and picture.pose.translation_m,

@@ -27,7 +27,7 @@ from cav_agent.session import AgentSession
 from rfcore.errors import CodecError, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.conventions import TILE, VEHICLE
 from rfcore.wire.convert import client_message_from_bytes
-from rfcore.wire.convert_answers import server_messages_to_bytes
+from rfcore.wire.convert_answers import AnswerWriter
 from rfcore.wire.head import FrameReader
 from rfcore.wire.messages import (
     Ack,
@@ -75,12 +75,13 @@ class MemoryStream:
         message = client_message_from_bytes(data)
         if isinstance(message, Hello):
             self._reader = FrameReader(message)
+            self._writer = AnswerWriter(camera.camera_id for camera in message.cameras)
         else:
             message = self._reader.read(message)
         self.received.append(message)
         answer = self._answer(message)
         if isinstance(answer, list):
-            for entry in server_messages_to_bytes(answer):
+            for entry in self._writer.messages(answer):
                 self._down.put_nowait(entry)
         else:
             self._down.put_nowait(answer)
@@ -192,7 +193,7 @@ def open_client(
         limits = limits or AgentLimits()
         session = AgentSession(hello, limits, rate_control)
         take = take or (lambda index: [make_capture(index, time.monotonic())])
-        source = CameraSource(take, coder, executor)
+        source = CameraSource(take, lambda job, _: coder(job), executor)
         return StreamClient(server, session, source, heard, heard, limits, tile="street")  # type: ignore[arg-type]
 
     return make

@@ -91,7 +91,7 @@ def test_the_line_of_an_answered_picture_has_its_sizes_digests_and_times(
     assert line["server_digest"] == line["reconstruction_digest"] == b"digest".hex()
     assert line["latency_ms"] == pytest.approx(80)
     own = {"read": 5, "render": 10, "encode": 20, "link": 40}
-    server = {"queue": 1, "render": 0, "splice": 0, "decode": 4, "total": 6}
+    server = {"queue": 1, "ahead": 0, "render": 0, "splice": 0, "decode": 4, "total": 6}
     expected = own | {f"server_{stage}": ms for stage, ms in server.items()}
     assert line["stage_ms"] == pytest.approx(expected)
 

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from cav_agent.config import AgentLimits
 from cav_agent.frames import Capture, FrameResult, Outcome
 from cav_agent.pending_frames import (
+    AHEAD_TRY_EVERY,
     SLOWEST_BPS,
+    AheadSwitch,
     AnswerTimeout,
     FramesInFlight,
     PredictionChain,
@@ -220,3 +222,75 @@ def test_an_epoch_without_a_packet_is_used_again() -> None:
     chain.started()
     chain.restart()
     assert chain.epoch == 5
+
+
+# --- poses ahead of their frames
+
+
+def poses_sent(
+    switch: AheadSwitch,
+    capture: Capture,
+    frames: int,
+    won_ms: float = 20.0,
+    waited_ms: float = 0.0,
+    s_per_byte: float = 2e-6,
+) -> int:
+    """Send frames of changing sizes; return how many had a pose ahead."""
+    sent = 0
+    for number in range(frames):
+        ahead_bytes = 14 if switch.next() else 0
+        sent += ahead_bytes > 0
+        size_bytes = 600 + 50 * (number % 5) + ahead_bytes
+        times = StageTimes(
+            queue_ns=round(1e6 * waited_ms), ahead_ns=round(1e6 * won_ms) if ahead_bytes else 0
+        )
+        result = FrameResult(
+            capture,
+            Outcome.ACKED,
+            packet_bytes=size_bytes,
+            ahead_bytes=ahead_bytes,
+            server=times,
+            link_s=0.05 + size_bytes * s_per_byte,
+        )
+        switch.answered(result)
+    return sent
+
+
+TRIED = 100 // AHEAD_TRY_EVERY
+
+
+@pytest.mark.parametrize(
+    ("link", "least", "most"),
+    [
+        ({}, 100, 100),
+        ({"won_ms": 0.0}, TRIED, 4 + TRIED),
+        ({"waited_ms": 20.0}, TRIED, 4 + TRIED),
+        ({"s_per_byte": 8 / 64e3}, 100, 100),
+        ({"s_per_byte": 8 / 16e3}, TRIED, 4 + TRIED),
+    ],
+    ids=["pays", "server full", "frame waited for it", "slow link", "too slow a link"],
+)
+def test_poses_are_sent_ahead_as_long_as_that_pays(
+    make_capture: MakeCapture, link: dict[str, float], least: int, most: int
+) -> None:
+    assert least <= poses_sent(AheadSwitch(True), make_capture(0), 100, **link) <= most
+
+
+def test_a_server_that_has_room_again_is_found(make_capture: MakeCapture) -> None:
+    switch = AheadSwitch(True)
+    poses_sent(switch, make_capture(0), 100, won_ms=0.0)
+    assert poses_sent(switch, make_capture(0), AHEAD_TRY_EVERY + 10) >= 10
+
+
+def test_a_frame_that_was_refused_after_its_pose_lets_the_next_go_without(
+    make_capture: MakeCapture,
+) -> None:
+    switch = AheadSwitch(True)
+    poses_sent(switch, make_capture(0), 10)
+    switch.failed()
+    assert not switch.next()
+    assert poses_sent(switch, make_capture(0), AHEAD_TRY_EVERY + 10) >= 10
+
+
+def test_none_is_sent_ahead_where_none_is_wanted(make_capture: MakeCapture) -> None:
+    assert poses_sent(AheadSwitch(False), make_capture(0), 100) == 0

@@ -22,7 +22,7 @@ from rfcore.field import Quality, render_field_view
 from rfcore.image import I420, Rgb
 from rfcore.localise.estimate import LocalisationState
 from rfcore.views import FieldView, View
-from rfcore.wire.messages import FrameAddress
+from rfcore.wire.messages import FrameAddress, PoseAhead
 
 LIMIT_BYTES = 300
 
@@ -220,3 +220,26 @@ def test_a_base_that_is_no_longer_kept_counts_as_none(noisy: Capture) -> None:
     assert packet.base_digest == b""
     kept = FrameAddress("front", packet.epoch, packet.sequence)
     assert pipeline.encode(EncodeJob(noisy, 0, 1, base=kept)).packet.sequence == 1
+
+
+def test_the_pose_is_announced_before_anything_is_rendered(noisy: Capture) -> None:
+    announced: list[PoseAhead] = []
+
+    class Late(Grey):
+        def render(self, camera: Camera, quality: Quality) -> View:
+            assert announced
+            return super().render(camera, quality)
+
+    pipeline = Pipeline(Late(), CodecConfig(32, 16, effort="fast"), lambda: 0)
+    noisy = replace(noisy, instant=7)
+    for epoch, sequence in ((3, 0), (3, 1), (4, 0)):
+        made = pipeline.encode(EncodeJob(noisy, epoch, 1), announced.append)
+        (ahead,) = announced
+        assert (ahead.epoch, ahead.sequence, ahead.instant) == (epoch, sequence, 7)
+        assert (made.packet.epoch, made.packet.sequence) == (epoch, sequence)
+        assert (ahead.pose, ahead.field_id, ahead.quality) == (
+            made.pose,
+            made.field_id,
+            made.rung.quality,
+        )
+        announced.clear()

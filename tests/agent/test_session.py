@@ -15,6 +15,7 @@ from cav_agent.frames import (
     StreamEnd,
 )
 from cav_agent.session import AgentSession, LinkState, OutgoingMessage
+from rfcore.camera import Pose
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.convert import hello_to_bytes
 from rfcore.wire.messages import (
@@ -26,6 +27,7 @@ from rfcore.wire.messages import (
     FrameAddress,
     Hello,
     Nack,
+    PoseAhead,
     StageTimes,
     Welcome,
 )
@@ -447,3 +449,52 @@ def test_between_inexact_renderers_no_frame_has_a_base(sender: Sender) -> None:
     sender.acked(sender.send())
     sender.send()
     assert [(job.base, job.exact) for job in sender.jobs] == [(None, False)] * 2
+
+
+# --- poses ahead of their frames
+
+
+def ahead_of(job: EncodeJob, sequence: int) -> PoseAhead:
+    capture = job.capture
+    pose = Pose.identity()
+    return PoseAhead(capture.camera_id, job.epoch, sequence, capture.capture_time_ns, pose)
+
+
+def test_a_pose_goes_ahead_of_its_frame_which_leaves_it_out(sender: Sender) -> None:
+    sizes = []
+    for number, ahead in enumerate([False, True]):
+        job = sender.start()
+        if ahead:
+            sender.session.located(job, ahead_of(job, number))
+            (outgoing,) = sender.session.messages_to_send(0.5)
+            assert outgoing.message == ahead_of(job, number)
+        sender.finish()
+        (frame,) = sender.written()
+        sizes.append(sender.sent_bytes)
+        sender.acked(frame)
+    (alone, after) = sender.session.take_results()
+    assert after.ahead_bytes == len(outgoing.data) > 0 == alone.ahead_bytes
+    assert after.packet_bytes == sizes[1] + after.ahead_bytes, "both count"
+    assert sizes[1] < sizes[0]
+
+
+def test_no_pose_goes_ahead_of_a_frame_that_will_not_be_sent(sender: Sender) -> None:
+    job = sender.start()
+    sender.session.connection_lost(UNAVAILABLE, 1.0)
+    sender.session.located(job, ahead_of(job, 0))
+    assert sender.session.messages_to_send(1.0) == []
+    sender.finish()
+    sender.connect("s-2")
+    sender.session.located(job, ahead_of(job, 0))
+    assert sender.session.messages_to_send(1.0) == []
+
+
+def test_a_frame_refused_after_its_pose_is_followed_by_one_that_says_all(sender: Sender) -> None:
+    job = sender.start()
+    sender.session.located(job, ahead_of(job, 0))
+    sender.finish()
+    (frame,) = sender.written()
+    sender.nacked(frame, RejectReason.UNKNOWN_STATE)
+    job = sender.start()
+    sender.session.located(job, ahead_of(job, 0))
+    assert sender.session.messages_to_send(1.0) == []

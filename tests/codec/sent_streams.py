@@ -20,6 +20,7 @@ from rfcore.native.yuv import i420_from_colour
 from rfcore.views import FieldView
 from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
+from rfcore.wire.v1.edge_pb2 import StreamRequest
 
 SIZE_PX = (64, 48)
 WALL_M = 10.0
@@ -82,6 +83,17 @@ def sent_frames(stream: SentStream) -> tuple[Hello, list[tuple[bytes, Frame]]]:
         frames.append((writer.data(frame, last), frame))
         last = frame.address
     return hello, frames
+
+
+def sent_after_poses(stream: SentStream) -> tuple[Hello, list[tuple[bytes, bytes, Frame]]]:
+    """Return the same of a vehicle that sends poses ahead: pose, frame as sent, and frame."""
+    hello, frames = sent_frames(stream)
+    writer, sent, last = FrameWriter(hello), [], None
+    for _, frame in frames:
+        ahead = StreamRequest.FromString(writer.ahead(frame.ahead, last)).pose_ahead
+        sent.append((ahead, writer.data(frame, last), frame))
+        last = frame.address
+    return hello, sent
 
 
 def exchange(

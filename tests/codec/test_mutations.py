@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -21,15 +20,17 @@ from codec.sent_streams import (
     SentStream,
     make_adapting_stream,
     make_stream,
+    sent_after_poses,
     sent_frames,
 )
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.codec.packet import RECONSTRUCTION_DIGEST_BYTES, DeltaPacket
+from rfcore.codec.packet import RECONSTRUCTION_DIGEST_BYTES, DeltaPacket, check_packet
+from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import RENDER_ONLY, Reference, is_temporal
 from rfcore.errors import PacketRejected, RejectReason
 from rfcore.wire import head
 from rfcore.wire.head import FrameReader, FrameRefused
-from rfcore.wire.messages import Hello
+from rfcore.wire.messages import Hello, PackedFrame
 
 Rng = np.random.Generator
 Mutation = Callable[[DeltaPacket, Rng], DeltaPacket]
@@ -151,12 +152,19 @@ def mutations_of(stream: SentStream) -> Mapping[str, Mutation]:
     }
 
 
-def outcome_of(decoder: DeltaDecoder, frame: SentFrame, packet: DeltaPacket) -> str:
+def outcome_of(
+    decoder: DeltaDecoder,
+    frame: SentFrame,
+    packet: DeltaPacket,
+    prepared: Prediction | None = None,
+) -> str:
     """Decode a packet in place of the frame's: "shown", if it is the frame's picture, or the reason
     of the refusal."""
     started_s = time.thread_time()  # decoding has no threads; other ones are none of its
+    before = frame.before
     try:
-        shown = decoder.decode(frame.before, packet, frame.view).frame
+        checked = check_packet(packet, before.epoch, before.next_sequence)
+        shown = decoder.decode_checked(before, checked, frame.view, prepared).frame
     except PacketRejected as rejection:
         outcome = str(rejection.reason)
     else:
@@ -218,7 +226,7 @@ def damage_messages(
     right = [data for data, _ in sent]
     readers = [reader_after(hello, right[:index]) for index in range(len(right))]
     if repaired:
-        monkeypatch.setattr(head, "_check", lambda *_: mock.ANY)
+        monkeypatch.setattr(head, "_require_check", lambda *_: None)
     rng, decoder, outcomes = (
         np.random.default_rng(seed),
         DeltaDecoder(stream.header),
@@ -240,10 +248,93 @@ def damage_messages(
     return outcomes
 
 
-def reader_after(hello: Hello, before: Sequence[bytes]) -> FrameReader:
+def prepared_frames(stream: SentStream, decoder: DeltaDecoder) -> list[Prediction]:
+    """Return what each frame is predicted from, made before it comes."""
+    return [
+        decoder.prepared(frame.before, frame.view, frame.packet.base_digest, frame.packet)
+        for frame in stream.frames
+    ]
+
+
+def damage_after_poses(
+    stream: SentStream, messages: int, seed: int, repaired: bool, monkeypatch: pytest.MonkeyPatch
+) -> Counter[str]:
+    """Damage poses ahead of frames, frames after them, or both; decode with what was prepared."""
+    hello, sent = sent_after_poses(stream)
+    if repaired:
+        monkeypatch.setattr(head, "_require_check", lambda *_: None)
+    rng, decoder, outcomes = (
+        np.random.default_rng(seed),
+        DeltaDecoder(stream.header),
+        Counter[str](),
+    )
+    prepared = prepared_frames(stream, decoder)
+    pairs = [(PackedFrame(ahead, is_ahead=True), data) for ahead, data, _ in sent]
+    before = [[data for pair in pairs[:index] for data in pair] for index in range(len(pairs))]
+    readers = [reader_after(hello, some) for some in before]
+    for _ in range(messages):
+        index, which = int(rng.integers(len(sent))), int(rng.integers(1, 4))
+        reader, frame = readers[index], stream.frames[index]
+        ahead, data, whole = sent[index]
+        try:
+            reader.ahead(damaged_data(ahead, rng) if which & 1 else ahead)
+        except FrameRefused as refused:
+            outcomes[f"pose {refused.reason}"] += 1
+        readers[index] = reader_after(hello, before[index])  # it has learnt a damaged pose
+        try:
+            read = reader.frame(damaged_data(data, rng) if which & 2 else data)
+        except FrameRefused as refused:
+            outcomes[str(refused.reason)] += 1
+            continue
+        assert repaired or read == whole
+        made: Prediction | None = prepared[index]
+        if read.pose != whole.pose:
+            frame, made = replace(frame, view=stream.frames[index - 1].view), prepared[index - 1]
+        outcomes[outcome_of(decoder, frame, read.packet, made)] += 1
+    return outcomes
+
+
+@pytest.mark.parametrize("name", ["stream", "adapting"])
+@pytest.mark.parametrize("repaired", [False, True])
+def test_damage_after_poses_never_shows_a_wrong_picture(name, repaired, request, monkeypatch):
+    outcomes = damage_after_poses(request.getfixturevalue(name), 1_000, 8, repaired, monkeypatch)
+    assert outcomes[RejectReason.UNKNOWN_STATE] > 10, "without its pose"
+    if repaired:
+        assert outcomes[RejectReason.RENDER_MISMATCH] > 10, "another pose"
+        assert outcomes[RejectReason.RECONSTRUCTION_MISMATCH] > 10
+    else:
+        assert outcomes[f"pose {RejectReason.CRC_MISMATCH}"] > 100
+        assert outcomes[RejectReason.CRC_MISMATCH] > 100
+
+
+@pytest.mark.parametrize("name", ["stream", "adapting"])
+def test_what_was_prepared_is_not_made_again(name, request, monkeypatch):
+    stream = request.getfixturevalue(name)
+    decoder = DeltaDecoder(stream.header)
+    prepared = prepared_frames(stream, decoder)
+    for make in ("warp_i420", "correct_i420", "relight_i420"):
+        monkeypatch.setattr(f"rfcore.codec.prediction.{make}", None)
+    for frame, made in zip(stream.frames, prepared, strict=True):
+        if frame.packet.needs_base and not frame.packet.photometric:
+            assert outcome_of(decoder, frame, frame.packet, made) == "shown"
+
+
+@pytest.mark.parametrize("name", ["stream", "adapting"])
+def test_what_was_prepared_for_another_packet_changes_no_picture(name, request):
+    stream = request.getfixturevalue(name)
+    decoder = DeltaDecoder(stream.header)
+    for frame in stream.frames:
+        bases = [past.digest[:RECONSTRUCTION_DIGEST_BYTES] for past in frame.before.kept]
+        for base in (b"", b"digest", *bases):
+            for like in (None, *(other.packet for other in stream.frames)):
+                made = decoder.prepared(frame.before, frame.view, base, like)
+                assert outcome_of(decoder, frame, frame.packet, made) == "shown"
+
+
+def reader_after(hello: Hello, before: Sequence[bytes | PackedFrame]) -> FrameReader:
     reader = FrameReader(hello)
     for data in before:
-        reader.frame(data)
+        reader.read(data if isinstance(data, PackedFrame) else PackedFrame(data))
     return reader
 
 
@@ -270,6 +361,7 @@ def test_a_million_damaged_messages_never_show_a_wrong_picture(
     name, repaired, request, monkeypatch
 ):
     damage_messages(request.getfixturevalue(name), 250_000, 6, repaired, monkeypatch)
+    damage_after_poses(request.getfixturevalue(name), 250_000, 9, repaired, monkeypatch)
 
 
 @pytest.mark.slow

@@ -19,12 +19,13 @@ from rfcore.native.yuv import i420_from_rgb
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import hello_to_bytes
-from rfcore.wire.convert_answers import server_messages_to_bytes
+from rfcore.wire.convert_answers import AnswerWriter
 from rfcore.wire.drive_file import CodedDrive, write_drive
 from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import (
     Ack,
     CameraDescription,
+    Credit,
     Frame,
     FrameAddress,
     Hello,
@@ -84,7 +85,7 @@ def put_wire() -> None:
     for name, data in zip(names, messages, strict=True):
         put("message", name, data)
     ack = Ack(FrameAddress("front", 1, 0), StageTimes(1, 2, 3), bytes(6))
-    put("message", "answers", server_messages_to_bytes([ack])[0])
+    put("message", "answers", AnswerWriter(["front"]).messages([ack, Credit("front", 3)])[0])
     for name, frame, data in zip(names[1:], frames, messages[1:], strict=True):
         put("packet", name, StreamRequest.FromString(data).frame)
         put("slices", name, frame.packet.payload)

@@ -41,7 +41,7 @@ from rfcore.field.store import decode_field
 from rfcore.views import FieldView
 from rfcore.wire import head
 from rfcore.wire.convert import client_message_from_bytes, hello_to_bytes
-from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.convert_answers import AnswerReader
 from rfcore.wire.drive_file import read_drive
 from rfcore.wire.head import FrameReader, FrameRefused
 from rfcore.wire.messages import Hello
@@ -60,7 +60,7 @@ def message(data: bytes) -> None:
         if isinstance(read, Hello):
             assert repr(client_message_from_bytes(hello_to_bytes(read))) == repr(read)
     with suppress(RfedgeError):
-        server_messages_from_bytes(data)
+        AnswerReader(["front", "rear"]).messages(data)
 
 
 def session(data: bytes) -> None:

@@ -33,7 +33,7 @@ from rfcore.perception import contacts
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT, STREAM_METHOD
 from rfcore.wire.convert import hello_to_bytes
-from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.convert_answers import AnswerReader
 from rfcore.wire.messages import (
     Ack,
     CameraDescription,
@@ -252,10 +252,12 @@ class RawVehicle:
         self.stream = stream
         self.server: EdgeServer | None = None
         self._hello: Hello | None = None
+        self._answers = AnswerReader()
 
     async def say(self, message: Hello | Frame | bytes) -> None:
         """Send a message, or bytes that only claim to be one."""
         if isinstance(message, Hello):
+            self._answers = AnswerReader(camera.camera_id for camera in message.cameras)
             self._hello, message = message, hello_to_bytes(message)
         elif isinstance(message, Frame):
             assert self._hello is not None
@@ -267,7 +269,7 @@ class RawVehicle:
         while True:
             data = await self.stream.read()
             assert data is not grpc.aio.EOF, "the server closed the stream"
-            for message in server_messages_from_bytes(data):
+            for message in self._answers.messages(data):
                 if not isinstance(message, Credit):
                     return message
 

@@ -55,6 +55,9 @@ async def test_four_cameras_are_one_session_with_one_pose_an_instant(
     async with serve() as server, vehicle(server.address, drive=None, rig=rig) as driving:
         counts = await driving.end()
         lines = driving.lines()
+        value = server.registry.get_sample_value
+        assert value("rfedge_server_poses_ahead_total", {"result": "taken"}) >= 4
+        assert value("rfedge_server_poses_ahead_total", {"result": "refused"}) == 0
     assert counts == Counter(acked=4 * FRAMES)
     assert {view.session_id for view in seen} == {seen[0].session_id}
     instants = defaultdict(set)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.latency.run import WINDOW, FrameWork, play, show
+from lab.latency.run import WINDOW, AheadWork, FrameWork, play, show
 from rfcore.link.plan import DirectionPlan
 from rfcore.link.shaper import LinkProfile
 
@@ -50,6 +50,15 @@ def test_dropped_frames_are_late_in_shares_and_quantiles():
     assert shown.share_within(160) == pytest.approx(4 / 10)
     assert shown.quantile_ms(0.25) == pytest.approx(150, abs=1e-3)
     assert shown.quantile_ms(0.99) == np.inf
+
+
+def test_with_the_pose_ahead_the_server_works_while_the_vehicle_codes_and_the_slice_travels():
+    link = DirectionPlan(LinkProfile(1e6, delay_s=0.02))  # 8 ms of a frame, 0.12 of a pose
+    work = [FrameWork(1000, 30.0, 28.0, AheadWork(15, 2.0, 24.0))] * 5
+    shown = show(work, 10, link)
+    np.testing.assert_allclose(shown.latency_ms, [30 + 8 + 20 + 4] * 5)
+    late = [FrameWork(1000, 30.0, 58.0, AheadWork(15, 2.0, 54.0))] * 5
+    np.testing.assert_allclose(show(late, 10, link).latency_ms, [2 + 0.12 + 20 + 54 + 4] * 5)
 
 
 @given(st.lists(works, min_size=1, max_size=40), st.floats(0.5, 60.0), st.floats(1e5, 1e8))

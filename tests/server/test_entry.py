@@ -125,7 +125,7 @@ def test_worker_time_binds_only_while_others_stream(hello: Hello, make_frame: ob
     entry = entry_control()
     account = entry.open("s-1", "greedy", named=True, now=0.0)
     account.enter(hello, Sender(), 0.0)
-    account.worked(hello.field_ids[0], 60.0, 0.0)
+    account.worked("front", hello.field_ids[0], 60.0, 0.0)
     account.spend_frame(frame, 10, 0.0)
     other = entry.open("s-2", "modest", named=True, now=0.0)
     other.enter(replace(hello, vehicle_id="modest"), Sender(), 0.0)
@@ -143,11 +143,11 @@ def test_who_was_alone_owes_nothing_when_somebody_comes(hello: Hello, make_frame
     account = entry.open("s-1", "slow", named=True, now=0.0)
     account.enter(hello, Sender(), 0.0)
     for second in range(60):
-        account.worked(hello.field_ids[0], 2.0, float(second))
+        account.worked("front", hello.field_ids[0], 2.0, float(second))
     other = entry.open("s-2", "modest", named=True, now=60.0)
     other.enter(replace(hello, vehicle_id="modest"), Sender(), 60.0)
     account.spend_frame(frame, 10, 60.5)
-    account.worked(hello.field_ids[0], 5.0, 60.5)
+    account.worked("front", hello.field_ids[0], 5.0, 60.5)
     with pytest.raises(LimitExceeded, match="identity_worker_seconds") as caught:
         account.spend_frame(frame, 10, 60.6)
     share = entry.ledger.budget(Resource.WORKER_SECONDS).identity
@@ -189,7 +189,7 @@ def test_work_for_who_caused_work_for_nothing_can_wait_until_that_is_made_up_for
     assert not account.is_doubtful(1.1 * refilled_s)
     account.opening_failed(10.0)
     assert account.is_doubtful(20.0)
-    account.worked(hello.field_ids[0], 0.01, 20.0)
+    account.worked("front", hello.field_ids[0], 0.01, 20.0)
     assert not account.is_doubtful(20.0), "a picture pays for the opening"
     assert not other.is_doubtful(0.0)
 
@@ -204,7 +204,7 @@ def test_streams_that_open_decoders_and_give_no_picture_make_their_identity_wait
         account.enter(hello, Sender(), 0.0)
         account.take_decoders().release()
         if gives_a_picture:
-            account.worked(hello.field_ids[0], 0.01, 0.0)
+            account.worked("front", hello.field_ids[0], 0.01, 0.0)
         account.ended(0.0)
         account.close()
 
@@ -228,3 +228,48 @@ def test_lines_beyond_the_burst_are_suppressed_counted_and_told_once() -> None:
     for number in range(5000):
         limiter.admit(f"name-{number}", later)
     assert len(limiter._buckets) <= 1024, "names cost no memory"
+
+
+def test_work_ahead_of_a_frame_is_charged_once_and_for_nothing_if_none_comes(
+    hello: Hello,
+) -> None:
+    entry = entry_control()
+    spent = entry.ledger.spent
+    account = entry.open("s-1", "cav-1", named=True, now=0.0)
+    account.enter(hello, Sender(), 0.0)
+    usual_s = account.expected_s("front")
+    account.prepared("front", 0.25 * usual_s, 0.0)
+    assert account.expected_s("front") == pytest.approx(0.75 * usual_s)
+    assert account.expected_s("rear") == usual_s
+    whole_s = account.worked("front", hello.field_ids[0], 0.5 * usual_s, 0.0)
+    assert whole_s == pytest.approx(0.75 * usual_s)
+    assert spent(Resource.WORKER_SECONDS) == pytest.approx(whole_s)
+    assert spent(Resource.REJECTED_SECONDS) == 0
+    for _ in range(3):
+        account.prepared("front", 0.1, 0.0)
+    assert spent(Resource.WORKER_SECONDS) == pytest.approx(whole_s + 0.3)
+    assert spent(Resource.REJECTED_SECONDS) == pytest.approx(0.2)
+    assert account.is_doubtful(0.0)
+    account.ended(0.0)
+    assert spent(Resource.REJECTED_SECONDS) == pytest.approx(0.3), "as the frames would have been"
+
+
+def test_poses_ahead_may_come_as_often_as_frames_and_take_none_of_theirs(
+    hello: Hello, make_frame: Callable[..., Frame]
+) -> None:
+    frame = make_frame(0)
+    account = entry_control().open("s-1", "cav-1", named=True, now=0.0)
+    account.enter(hello, Sender(), 0.0)
+    account.grant(2.0, 0.0)
+
+    def taken(spend: Callable[[], None]) -> int:
+        for number in range(10_000):
+            try:
+                spend()
+            except LimitExceeded:
+                return number
+        raise AssertionError("no limit")
+
+    poses = taken(lambda: account.spend_ahead(frame.ahead, 10, 1e3))
+    frames = taken(lambda: account.spend_frame(frame, 10, 1e3))
+    assert poses == frames

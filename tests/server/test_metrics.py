@@ -108,7 +108,7 @@ REFERENCES = [
     order for count in range(REFERENCE_FRAMES + 1) for order in permutations(Reference, count)
 ]
 CLOSED = {
-    "result": {"acked", "nacked", *OpeningResult},
+    "result": {"acked", "nacked", "taken", "refused", *OpeningResult},
     "reason": {"", "lost", "full", *RejectReason, *ConsumerEnd},
     "references": set(map(references_name, REFERENCES)),
     "stage": set(STAGES),

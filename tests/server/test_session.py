@@ -10,6 +10,7 @@ from mec_server.session import (
     MAX_UNUSABLE,
     DecodeJob,
     OpenJob,
+    PrepareJob,
     ServerSession,
     SessionState,
 )
@@ -430,3 +431,78 @@ def test_draining_an_idle_session_closes_it_at_once(session: ServerSession) -> N
 def test_bad_limits_are_refused_by_name(change: dict[str, float], named: str) -> None:
     with pytest.raises(InvalidInput, match=named):
         SessionLimits(**change)  # type: ignore[arg-type]
+
+
+# --- poses ahead of their frames
+
+
+def test_a_pose_is_prepared_before_its_frame_which_waits_for_it(
+    session: ServerSession, make_frame: MakeFrame
+) -> None:
+    frame = make_frame(0)
+    session.receive(frame.ahead, 1.0)
+    (job,) = session.poses_to_prepare()
+    assert job == PrepareJob(frame.ahead, FIELD)
+    assert session.poses_to_prepare() == []
+    session.receive(frame, 1.1)
+    assert session.jobs_to_start(1.1) == [], "one piece of work a camera"
+    session.prepared(job)
+    (decoding,) = session.jobs_to_start(1.2)
+    assert isinstance(decoding, DecodeJob)
+    session.decoded(decoding, DIGEST, StageTimes(ahead_ns=7), 1.3)
+    (ack, credit) = session.messages_to_send(1.3)
+    assert isinstance(ack, Ack)
+    assert ack.times.ahead_ns == 7
+    assert credit == Credit("front", 3), "a pose takes no credit and has no answer"
+
+
+def test_a_pose_whose_frame_is_here_or_replaced_is_not_prepared(
+    session: ServerSession, make_frame: MakeFrame
+) -> None:
+    session.receive(make_frame(0).ahead, 1.0)
+    session.receive(make_frame(0), 1.0)
+    (running,) = session.jobs_to_start(1.0)
+    assert session.poses_to_prepare() == []
+    session.receive(make_frame(1).ahead, 1.0)
+    session.receive(make_frame(2).ahead, 1.0)
+    assert session.poses_to_prepare() == [], "a frame is being decoded"
+    assert isinstance(running, DecodeJob)
+    session.decoded(running, DIGEST, StageTimes(), 1.1)
+    (job,) = session.poses_to_prepare()
+    assert job.ahead == make_frame(2).ahead
+
+
+def test_a_pose_of_an_old_frame_is_not_prepared(
+    session: ServerSession, make_frame: MakeFrame
+) -> None:
+    assert deliver(session, [make_frame(3, epoch=2)])[-1] == ("ack", 3)
+    for stale in (make_frame(3, epoch=2), make_frame(9, epoch=1), make_frame(99, epoch=2)):
+        session.receive(stale.ahead, 1.0)
+        assert session.poses_to_prepare() == []
+
+
+def test_a_pose_before_welcome_or_while_draining_is_of_no_use(
+    hello: Hello, session: ServerSession, make_frame: MakeFrame
+) -> None:
+    opening = ServerSession("s-1", [FIELD], now=0.0)
+    opening.receive(hello, 0.0)
+    opening.receive(make_frame(0).ahead, 0.0)
+    session.receive(make_frame(0), 1.0)
+    session.jobs_to_start(1.0)
+    session.drain()
+    session.receive(make_frame(1).ahead, 1.0)
+    for quiet in (opening, session):
+        assert quiet.poses_to_prepare() == []
+        assert quiet.messages_to_send(1.0) == []
+        assert quiet.closed is None
+
+
+def test_poses_that_are_refused_have_no_answer_and_too_many_end_the_stream(
+    session: ServerSession,
+) -> None:
+    for _ in range(MAX_UNUSABLE):
+        assert session.closed is None
+        session.refuse_ahead()
+    assert session.messages_to_send(1.0) == []
+    assert session.closed is not None
+    assert isinstance(session.closed.error, LimitExceeded)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.errors import ProtocolError
-from rfcore.wire.convert_answers import server_messages_from_bytes, server_messages_to_bytes
+from rfcore.wire.convert_answers import AnswerReader, AnswerWriter
 from rfcore.wire.notices import (
     NOTICE_KINDS,
     FieldChange,
@@ -49,8 +49,8 @@ notices = st.builds(StreetNotice, st.integers(0, 2**63), milliseconds, st.one_of
 
 @given(notice=notices)
 def test_a_notice_survives_the_wire(notice: StreetNotice) -> None:
-    (data,) = server_messages_to_bytes([notice])
-    assert server_messages_from_bytes(data) == [notice]
+    (data,) = AnswerWriter().messages([notice])
+    assert AnswerReader().messages(data) == [notice]
     assert notice.kind in NOTICE_KINDS
 
 
@@ -78,14 +78,14 @@ def sent(**changes: Any) -> bytes:
 )
 def test_an_impossible_object_is_refused(change: dict[str, Any], problem: str) -> None:
     with pytest.raises(ProtocolError, match=r"impossible notice.*" + problem):
-        server_messages_from_bytes(sent(**change))
+        AnswerReader().messages(sent(**change))
 
 
 def test_a_notice_that_holds_for_hours_is_refused() -> None:
     message = pb.StreetNotice(notice_id=1, valid_for_ms=3_600_001)
     message.field_change.CopyFrom(pb.FieldChange(kind=1, tile="west", field_id=FIELD, version=1))
     with pytest.raises(ProtocolError, match="valid_for_s"):
-        server_messages_from_bytes(pb.StreamResponse(street_notice=message).SerializeToString())
+        AnswerReader().messages(pb.StreamResponse(street_notice=message).SerializeToString())
 
 
 @pytest.mark.parametrize(
@@ -98,4 +98,4 @@ def test_a_notice_that_holds_for_hours_is_refused() -> None:
 )
 def test_what_only_a_newer_server_tells_of_is_left_out(notice: pb.StreetNotice) -> None:
     data = pb.StreamResponse(street_notice=notice).SerializeToString()
-    assert server_messages_from_bytes(data) == []
+    assert AnswerReader().messages(data) == []

@@ -201,41 +201,42 @@ class StreamResponse(_message.Message):
     ACK_FIELD_NUMBER: _builtins.int
     NACK_FIELD_NUMBER: _builtins.int
     FIELD_NOTICE_FIELD_NUMBER: _builtins.int
+    CREDIT_FIELD_NUMBER: _builtins.int
     DRAIN_NOTICE_FIELD_NUMBER: _builtins.int
     STREET_NOTICE_FIELD_NUMBER: _builtins.int
-    CREDIT_FIELD_NUMBER: _builtins.int
+    ack: _builtins.bytes
+    """The frame was reconstructed and is what the sender's closed loop holds: its address, the
+    server's times, the digest of its picture, and the camera's Credit, packed.
+    `rfcore.wire.convert_answers` (File formats: "Answers to frames") has the layout to the bit.
+    """
     @_builtins.property
     def welcome(self) -> Global___Welcome: ...
-    @_builtins.property
-    def ack(self) -> Global___Ack: ...
     @_builtins.property
     def nack(self) -> Global___Nack: ...
     @_builtins.property
     def field_notice(self) -> Global___FieldNotice: ...
     @_builtins.property
+    def credit(self) -> Global___Credit: ...
+    @_builtins.property
     def drain_notice(self) -> Global___DrainNotice: ...
     @_builtins.property
     def street_notice(self) -> Global___StreetNotice: ...
-    @_builtins.property
-    def credit(self) -> Global___Credit:
-        """Alone, or in the message of the answer that changed it, which saves a message a frame."""
-
     def __init__(
         self,
         *,
         welcome: Global___Welcome | None = ...,
-        ack: Global___Ack | None = ...,
+        ack: _builtins.bytes = ...,
         nack: Global___Nack | None = ...,
         field_notice: Global___FieldNotice | None = ...,
+        credit: Global___Credit | None = ...,
         drain_notice: Global___DrainNotice | None = ...,
         street_notice: Global___StreetNotice | None = ...,
-        credit: Global___Credit | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "drain_notice", b"drain_notice", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "street_notice", b"street_notice", "welcome", b"welcome"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
     _ClearFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "drain_notice", b"drain_notice", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "street_notice", b"street_notice", "welcome", b"welcome"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["welcome", "ack", "nack", "field_notice", "drain_notice", "street_notice"]  # noqa: Y015
+    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["welcome", "ack", "nack", "field_notice", "credit", "drain_notice", "street_notice"]  # noqa: Y015
     _WhichOneofArgType_message: _TypeAlias = _typing.Literal["message", b"message"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_message) -> _WhichOneofReturnType_message | None: ...
 
@@ -559,74 +560,6 @@ class Welcome(_message.Message):
 Global___Welcome: _TypeAlias = Welcome  # noqa: Y015
 
 @_typing.final
-class Ack(_message.Message):
-    """The frame was reconstructed and is what the sender's closed loop holds."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    CAMERA_ID_FIELD_NUMBER: _builtins.int
-    EPOCH_FIELD_NUMBER: _builtins.int
-    SEQUENCE_FIELD_NUMBER: _builtins.int
-    TIMES_FIELD_NUMBER: _builtins.int
-    RECONSTRUCTION_DIGEST_FIELD_NUMBER: _builtins.int
-    camera_id: _builtins.str
-    epoch: _builtins.int
-    sequence: _builtins.int
-    reconstruction_digest: _builtins.bytes
-    """Of the server's picture, as long as the frame's."""
-    @_builtins.property
-    def times(self) -> Global___StageTimes: ...
-    def __init__(
-        self,
-        *,
-        camera_id: _builtins.str = ...,
-        epoch: _builtins.int = ...,
-        sequence: _builtins.int = ...,
-        times: Global___StageTimes | None = ...,
-        reconstruction_digest: _builtins.bytes = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["times", b"times"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "epoch", b"epoch", "reconstruction_digest", b"reconstruction_digest", "sequence", b"sequence", "times", b"times"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Ack: _TypeAlias = Ack  # noqa: Y015
-
-@_typing.final
-class StageTimes(_message.Message):
-    """Where the server's time went for one frame."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    QUEUE_NS_FIELD_NUMBER: _builtins.int
-    RENDER_NS_FIELD_NUMBER: _builtins.int
-    SPLICE_NS_FIELD_NUMBER: _builtins.int
-    DECODE_NS_FIELD_NUMBER: _builtins.int
-    TOTAL_NS_FIELD_NUMBER: _builtins.int
-    queue_ns: _builtins.int
-    render_ns: _builtins.int
-    splice_ns: _builtins.int
-    decode_ns: _builtins.int
-    total_ns: _builtins.int
-    def __init__(
-        self,
-        *,
-        queue_ns: _builtins.int = ...,
-        render_ns: _builtins.int = ...,
-        splice_ns: _builtins.int = ...,
-        decode_ns: _builtins.int = ...,
-        total_ns: _builtins.int = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["decode_ns", b"decode_ns", "queue_ns", b"queue_ns", "render_ns", b"render_ns", "splice_ns", b"splice_ns", "total_ns", b"total_ns"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___StageTimes: _TypeAlias = StageTimes  # noqa: Y015
-
-@_typing.final
 class Nack(_message.Message):
     """Frames that did not become pictures: count of them from sequence on."""
 
@@ -862,23 +795,26 @@ Global___FieldChange: _TypeAlias = FieldChange  # noqa: Y015
 
 @_typing.final
 class Credit(_message.Message):
-    """Since Hello, this camera may send so many frames in all. The count never falls."""
+    """Since Hello, this camera may send so many frames in all. The count never falls. With an Ack it is
+    a part of that.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
-    CAMERA_ID_FIELD_NUMBER: _builtins.int
+    CAMERA_FIELD_NUMBER: _builtins.int
     FRAMES_FIELD_NUMBER: _builtins.int
-    camera_id: _builtins.str
+    camera: _builtins.int
+    """Its place in Hello."""
     frames: _builtins.int
     def __init__(
         self,
         *,
-        camera_id: _builtins.str = ...,
+        camera: _builtins.int = ...,
         frames: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "frames", b"frames"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "frames", b"frames"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -25,43 +25,43 @@ _sym_db = _symbol_database.Default()
 from rfcore.wire.v1 import edge_pb2 as rfcore_dot_wire_dot_v1_dot_edge__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19rfcore/wire/v1/twin.proto\x12\x0erfcore.wire.v1\x1a\x19rfcore/wire/v1/edge.proto\"V\n\x0cWatchRequest\x12\x13\n\x0bvehicle_ids\x18\x01 \x03(\t\x12\x31\n\x08\x65ncoding\x18\x02 \x01(\x0e\x32\x1f.rfcore.wire.v1.PictureEncoding\"z\n\rWatchResponse\x12.\n\x07picture\x18\x01 \x01(\x0b\x32\x1b.rfcore.wire.v1.TwinPictureH\x00\x12.\n\tdeparture\x18\x02 \x01(\x0b\x32\x19.rfcore.wire.v1.DepartureH\x00\x42\t\n\x07message\"\xac\x04\n\x0bTwinPicture\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x11\n\tcamera_id\x18\x02 \x01(\t\x12\x12\n\nsession_id\x18\x03 \x01(\t\x12\r\n\x05\x65poch\x18\x04 \x01(\r\x12\x10\n\x08sequence\x18\x05 \x01(\x04\x12\x17\n\x0f\x63\x61pture_time_ns\x18\x06 \x01(\x06\x12\x0e\n\x06\x61ge_ns\x18\x07 \x01(\x04\x12\"\n\x04pose\x18\x08 \x01(\x0b\x32\x14.rfcore.wire.v1.Pose\x12.\n\nintrinsics\x18\t \x01(\x0b\x32\x1a.rfcore.wire.v1.Intrinsics\x12\x10\n\x08\x66ield_id\x18\n \x01(\t\x12\x1d\n\x15reconstruction_digest\x18\x0b \x01(\x0c\x12\x31\n\x08\x65ncoding\x18\x0c \x01(\x0e\x32\x1f.rfcore.wire.v1.PictureEncoding\x12\x0f\n\x07picture\x18\r \x01(\x0c\x12\x0f\n\x07skipped\x18\x0e \x01(\x04\x12\x15\n\rpayload_bytes\x18\x0f \x01(\r\x12-\n\nreferences\x18\x10 \x03(\x0e\x32\x19.rfcore.wire.v1.Reference\x12\x0f\n\x07instant\x18\x11 \x01(\x04\x12\x33\n\rcapture_clock\x18\x12 \x01(\x0e\x32\x1c.rfcore.wire.v1.CaptureClock\x12\x32\n\x0clocalisation\x18\x13 \x01(\x0e\x32\x1c.rfcore.wire.v1.Localisation\"2\n\tDeparture\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x11\n\tcamera_id\x18\x02 \x01(\t\";\n\nWorldPlace\x12\x0e\n\x06\x65\x61st_m\x18\x01 \x01(\x01\x12\x0f\n\x07north_m\x18\x02 \x01(\x01\x12\x0c\n\x04up_m\x18\x03 \x01(\x01\"\xc0\x02\n\rRenderRequest\x12\x0c\n\x04tile\x18\x01 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12\"\n\x04pose\x18\x03 \x01(\x0b\x32\x14.rfcore.wire.v1.Pose\x12.\n\nintrinsics\x18\x04 \x01(\x0b\x32\x1a.rfcore.wire.v1.Intrinsics\x12(\n\x07quality\x18\x05 \x01(\x0b\x32\x17.rfcore.wire.v1.Quality\x12\x31\n\x08\x65ncoding\x18\x06 \x01(\x0e\x32\x1f.rfcore.wire.v1.PictureEncoding\x12\x12\n\nmax_age_ms\x18\x07 \x01(\r\x12\x0e\n\x06number\x18\x08 \x01(\x04\x12)\n\x05place\x18\t \x01(\x0b\x32\x1a.rfcore.wire.v1.WorldPlace\x12\x0f\n\x07time_ns\x18\n \x01(\x06\"\xe6\x01\n\x0eRenderResponse\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x0f\n\x07skipped\x18\x02 \x01(\x04\x12\x0f\n\x07time_ns\x18\x03 \x01(\x06\x12\x10\n\x08\x66ield_id\x18\x04 \x01(\t\x12\x31\n\x08\x65ncoding\x18\x05 \x01(\x0e\x32\x1f.rfcore.wire.v1.PictureEncoding\x12\x0f\n\x07picture\x18\x06 \x01(\x0c\x12\x0f\n\x07\x64\x65pth_m\x18\x07 \x01(\x0c\x12\x0e\n\x06\x61ge_ms\x18\x08 \x01(\x0c\x12+\n\x07\x63\x61meras\x18\t \x03(\x0b\x32\x1a.rfcore.wire.v1.LiveCamera\"d\n\nLiveCamera\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x11\n\tcamera_id\x18\x02 \x01(\t\x12\x0e\n\x06\x61ge_ms\x18\x03 \x01(\r\x12\r\n\x05share\x18\x04 \x01(\x01\x12\x10\n\x08outvoted\x18\x05 \x01(\x08\"B\n\x13RenderStreamRequest\x12+\n\x04view\x18\x01 \x01(\x0b\x32\x1d.rfcore.wire.v1.RenderRequest\"D\n\x14RenderStreamResponse\x12,\n\x04view\x18\x01 \x01(\x0b\x32\x1e.rfcore.wire.v1.RenderResponse\"[\n\x0eObjectsRequest\x12\x0c\n\x04tile\x18\x01 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12)\n\x05place\x18\x03 \x01(\x0b\x32\x1a.rfcore.wire.v1.WorldPlace\"c\n\x0fObjectsResponse\x12\x0f\n\x07time_ns\x18\x01 \x01(\x06\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12-\n\x07objects\x18\x03 \x03(\x0b\x32\x1c.rfcore.wire.v1.StreetObject\"\xb6\x02\n\x0cStreetObject\x12\x11\n\tobject_id\x18\x01 \x01(\x04\x12\x0b\n\x03x_m\x18\x02 \x01(\x01\x12\x0b\n\x03y_m\x18\x03 \x01(\x01\x12\x0b\n\x03z_m\x18\x04 \x01(\x01\x12\x16\n\x0evelocity_x_mps\x18\x05 \x01(\x01\x12\x16\n\x0evelocity_y_mps\x18\x06 \x01(\x01\x12\x16\n\x0evelocity_z_mps\x18\x07 \x01(\x01\x12\x0f\n\x07width_m\x18\x08 \x01(\x01\x12\x10\n\x08height_m\x18\t \x01(\x01\x12\x12\n\nconfidence\x18\n \x01(\x01\x12\x0e\n\x06\x61ge_ms\x18\x0b \x01(\r\x12\x11\n\tunseen_ms\x18\x0c \x01(\r\x12)\n\x07seen_by\x18\r \x03(\x0b\x32\x18.rfcore.wire.v1.Sighting\x12\x10\n\x08\x64oubtful\x18\x0e \x01(\x08\x12\r\n\x05label\x18\x0f \x01(\t\"1\n\x08Sighting\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x11\n\tcamera_id\x18\x02 \x01(\t*\x9e\x01\n\x0fPictureEncoding\x12 \n\x1cPICTURE_ENCODING_UNSPECIFIED\x10\x00\x12\x19\n\x15PICTURE_ENCODING_NONE\x10\x01\x12\x19\n\x15PICTURE_ENCODING_I420\x10\x02\x12\x19\n\x15PICTURE_ENCODING_JPEG\x10\x03\x12\x18\n\x14PICTURE_ENCODING_PNG\x10\x04\x32\xcb\x02\n\x0bTwinService\x12\x46\n\x05Watch\x12\x1c.rfcore.wire.v1.WatchRequest\x1a\x1d.rfcore.wire.v1.WatchResponse0\x01\x12G\n\x06Render\x12\x1d.rfcore.wire.v1.RenderRequest\x1a\x1e.rfcore.wire.v1.RenderResponse\x12]\n\x0cRenderStream\x12#.rfcore.wire.v1.RenderStreamRequest\x1a$.rfcore.wire.v1.RenderStreamResponse(\x01\x30\x01\x12L\n\x07Objects\x12\x1e.rfcore.wire.v1.ObjectsRequest\x1a\x1f.rfcore.wire.v1.ObjectsResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19rfcore/wire/v1/twin.proto\x12\x0erfcore.wire.v1\x1a\x19rfcore/wire/v1/edge.proto\"V\n\x0cWatchRequest\x12\x13\n\x0bvehicle_ids\x18\x01 \x03(\t\x12\x31\n\x08\x65ncoding\x18\x02 \x01(\x0e\x32\x1f.rfcore.wire.v1.PictureEncoding\"z\n\rWatchResponse\x12.\n\x07picture\x18\x01 \x01(\x0b\x32\x1b.rfcore.wire.v1.TwinPictureH\x00\x12.\n\tdeparture\x18\x02 \x01(\x0b\x32\x19.rfcore.wire.v1.DepartureH\x00\x42\t\n\x07message\"\xc1\x04\n\x0bTwinPicture\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x11\n\tcamera_id\x18\x02 \x01(\t\x12\x12\n\nsession_id\x18\x03 \x01(\t\x12\r\n\x05\x65poch\x18\x04 \x01(\r\x12\x10\n\x08sequence\x18\x05 \x01(\x04\x12\x17\n\x0f\x63\x61pture_time_ns\x18\x06 \x01(\x06\x12\x0e\n\x06\x61ge_ns\x18\x07 \x01(\x04\x12\"\n\x04pose\x18\x08 \x01(\x0b\x32\x14.rfcore.wire.v1.Pose\x12.\n\nintrinsics\x18\t \x01(\x0b\x32\x1a.rfcore.wire.v1.Intrinsics\x12\x10\n\x08\x66ield_id\x18\n \x01(\t\x12\x1d\n\x15reconstruction_digest\x18\x0b \x01(\x0c\x12\x31\n\x08\x65ncoding\x18\x0c \x01(\x0e\x32\x1f.rfcore.wire.v1.PictureEncoding\x12\x0f\n\x07picture\x18\r \x01(\x0c\x12\x0f\n\x07skipped\x18\x0e \x01(\x04\x12\x15\n\rpayload_bytes\x18\x0f \x01(\r\x12-\n\nreferences\x18\x10 \x03(\x0e\x32\x19.rfcore.wire.v1.Reference\x12\x0f\n\x07instant\x18\x11 \x01(\x04\x12\x33\n\rcapture_clock\x18\x12 \x01(\x0e\x32\x1c.rfcore.wire.v1.CaptureClock\x12\x32\n\x0clocalisation\x18\x13 \x01(\x0e\x32\x1c.rfcore.wire.v1.Localisation\x12\x13\n\x0b\x64\x65\x63oding_ns\x18\x14 \x01(\x04\"2\n\tDeparture\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x11\n\tcamera_id\x18\x02 \x01(\t\";\n\nWorldPlace\x12\x0e\n\x06\x65\x61st_m\x18\x01 \x01(\x01\x12\x0f\n\x07north_m\x18\x02 \x01(\x01\x12\x0c\n\x04up_m\x18\x03 \x01(\x01\"\xc0\x02\n\rRenderRequest\x12\x0c\n\x04tile\x18\x01 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12\"\n\x04pose\x18\x03 \x01(\x0b\x32\x14.rfcore.wire.v1.Pose\x12.\n\nintrinsics\x18\x04 \x01(\x0b\x32\x1a.rfcore.wire.v1.Intrinsics\x12(\n\x07quality\x18\x05 \x01(\x0b\x32\x17.rfcore.wire.v1.Quality\x12\x31\n\x08\x65ncoding\x18\x06 \x01(\x0e\x32\x1f.rfcore.wire.v1.PictureEncoding\x12\x12\n\nmax_age_ms\x18\x07 \x01(\r\x12\x0e\n\x06number\x18\x08 \x01(\x04\x12)\n\x05place\x18\t \x01(\x0b\x32\x1a.rfcore.wire.v1.WorldPlace\x12\x0f\n\x07time_ns\x18\n \x01(\x06\"\xe6\x01\n\x0eRenderResponse\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x0f\n\x07skipped\x18\x02 \x01(\x04\x12\x0f\n\x07time_ns\x18\x03 \x01(\x06\x12\x10\n\x08\x66ield_id\x18\x04 \x01(\t\x12\x31\n\x08\x65ncoding\x18\x05 \x01(\x0e\x32\x1f.rfcore.wire.v1.PictureEncoding\x12\x0f\n\x07picture\x18\x06 \x01(\x0c\x12\x0f\n\x07\x64\x65pth_m\x18\x07 \x01(\x0c\x12\x0e\n\x06\x61ge_ms\x18\x08 \x01(\x0c\x12+\n\x07\x63\x61meras\x18\t \x03(\x0b\x32\x1a.rfcore.wire.v1.LiveCamera\"d\n\nLiveCamera\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x11\n\tcamera_id\x18\x02 \x01(\t\x12\x0e\n\x06\x61ge_ms\x18\x03 \x01(\r\x12\r\n\x05share\x18\x04 \x01(\x01\x12\x10\n\x08outvoted\x18\x05 \x01(\x08\"B\n\x13RenderStreamRequest\x12+\n\x04view\x18\x01 \x01(\x0b\x32\x1d.rfcore.wire.v1.RenderRequest\"D\n\x14RenderStreamResponse\x12,\n\x04view\x18\x01 \x01(\x0b\x32\x1e.rfcore.wire.v1.RenderResponse\"[\n\x0eObjectsRequest\x12\x0c\n\x04tile\x18\x01 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12)\n\x05place\x18\x03 \x01(\x0b\x32\x1a.rfcore.wire.v1.WorldPlace\"c\n\x0fObjectsResponse\x12\x0f\n\x07time_ns\x18\x01 \x01(\x06\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12-\n\x07objects\x18\x03 \x03(\x0b\x32\x1c.rfcore.wire.v1.StreetObject\"\xb6\x02\n\x0cStreetObject\x12\x11\n\tobject_id\x18\x01 \x01(\x04\x12\x0b\n\x03x_m\x18\x02 \x01(\x01\x12\x0b\n\x03y_m\x18\x03 \x01(\x01\x12\x0b\n\x03z_m\x18\x04 \x01(\x01\x12\x16\n\x0evelocity_x_mps\x18\x05 \x01(\x01\x12\x16\n\x0evelocity_y_mps\x18\x06 \x01(\x01\x12\x16\n\x0evelocity_z_mps\x18\x07 \x01(\x01\x12\x0f\n\x07width_m\x18\x08 \x01(\x01\x12\x10\n\x08height_m\x18\t \x01(\x01\x12\x12\n\nconfidence\x18\n \x01(\x01\x12\x0e\n\x06\x61ge_ms\x18\x0b \x01(\r\x12\x11\n\tunseen_ms\x18\x0c \x01(\r\x12)\n\x07seen_by\x18\r \x03(\x0b\x32\x18.rfcore.wire.v1.Sighting\x12\x10\n\x08\x64oubtful\x18\x0e \x01(\x08\x12\r\n\x05label\x18\x0f \x01(\t\"1\n\x08Sighting\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x11\n\tcamera_id\x18\x02 \x01(\t*\x9e\x01\n\x0fPictureEncoding\x12 \n\x1cPICTURE_ENCODING_UNSPECIFIED\x10\x00\x12\x19\n\x15PICTURE_ENCODING_NONE\x10\x01\x12\x19\n\x15PICTURE_ENCODING_I420\x10\x02\x12\x19\n\x15PICTURE_ENCODING_JPEG\x10\x03\x12\x18\n\x14PICTURE_ENCODING_PNG\x10\x04\x32\xcb\x02\n\x0bTwinService\x12\x46\n\x05Watch\x12\x1c.rfcore.wire.v1.WatchRequest\x1a\x1d.rfcore.wire.v1.WatchResponse0\x01\x12G\n\x06Render\x12\x1d.rfcore.wire.v1.RenderRequest\x1a\x1e.rfcore.wire.v1.RenderResponse\x12]\n\x0cRenderStream\x12#.rfcore.wire.v1.RenderStreamRequest\x1a$.rfcore.wire.v1.RenderStreamResponse(\x01\x30\x01\x12L\n\x07Objects\x12\x1e.rfcore.wire.v1.ObjectsRequest\x1a\x1f.rfcore.wire.v1.ObjectsResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'rfcore.wire.v1.twin_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_PICTUREENCODING']._serialized_start=2311
-  _globals['_PICTUREENCODING']._serialized_end=2469
+  _globals['_PICTUREENCODING']._serialized_start=2332
+  _globals['_PICTUREENCODING']._serialized_end=2490
   _globals['_WATCHREQUEST']._serialized_start=72
   _globals['_WATCHREQUEST']._serialized_end=158
   _globals['_WATCHRESPONSE']._serialized_start=160
   _globals['_WATCHRESPONSE']._serialized_end=282
   _globals['_TWINPICTURE']._serialized_start=285
-  _globals['_TWINPICTURE']._serialized_end=841
-  _globals['_DEPARTURE']._serialized_start=843
-  _globals['_DEPARTURE']._serialized_end=893
-  _globals['_WORLDPLACE']._serialized_start=895
-  _globals['_WORLDPLACE']._serialized_end=954
-  _globals['_RENDERREQUEST']._serialized_start=957
-  _globals['_RENDERREQUEST']._serialized_end=1277
-  _globals['_RENDERRESPONSE']._serialized_start=1280
-  _globals['_RENDERRESPONSE']._serialized_end=1510
-  _globals['_LIVECAMERA']._serialized_start=1512
-  _globals['_LIVECAMERA']._serialized_end=1612
-  _globals['_RENDERSTREAMREQUEST']._serialized_start=1614
-  _globals['_RENDERSTREAMREQUEST']._serialized_end=1680
-  _globals['_RENDERSTREAMRESPONSE']._serialized_start=1682
-  _globals['_RENDERSTREAMRESPONSE']._serialized_end=1750
-  _globals['_OBJECTSREQUEST']._serialized_start=1752
-  _globals['_OBJECTSREQUEST']._serialized_end=1843
-  _globals['_OBJECTSRESPONSE']._serialized_start=1845
-  _globals['_OBJECTSRESPONSE']._serialized_end=1944
-  _globals['_STREETOBJECT']._serialized_start=1947
-  _globals['_STREETOBJECT']._serialized_end=2257
-  _globals['_SIGHTING']._serialized_start=2259
-  _globals['_SIGHTING']._serialized_end=2308
-  _globals['_TWINSERVICE']._serialized_start=2472
-  _globals['_TWINSERVICE']._serialized_end=2803
+  _globals['_TWINPICTURE']._serialized_end=862
+  _globals['_DEPARTURE']._serialized_start=864
+  _globals['_DEPARTURE']._serialized_end=914
+  _globals['_WORLDPLACE']._serialized_start=916
+  _globals['_WORLDPLACE']._serialized_end=975
+  _globals['_RENDERREQUEST']._serialized_start=978
+  _globals['_RENDERREQUEST']._serialized_end=1298
+  _globals['_RENDERRESPONSE']._serialized_start=1301
+  _globals['_RENDERRESPONSE']._serialized_end=1531
+  _globals['_LIVECAMERA']._serialized_start=1533
+  _globals['_LIVECAMERA']._serialized_end=1633
+  _globals['_RENDERSTREAMREQUEST']._serialized_start=1635
+  _globals['_RENDERSTREAMREQUEST']._serialized_end=1701
+  _globals['_RENDERSTREAMRESPONSE']._serialized_start=1703
+  _globals['_RENDERSTREAMRESPONSE']._serialized_end=1771
+  _globals['_OBJECTSREQUEST']._serialized_start=1773
+  _globals['_OBJECTSREQUEST']._serialized_end=1864
+  _globals['_OBJECTSRESPONSE']._serialized_start=1866
+  _globals['_OBJECTSRESPONSE']._serialized_end=1965
+  _globals['_STREETOBJECT']._serialized_start=1968
+  _globals['_STREETOBJECT']._serialized_end=2278
+  _globals['_SIGHTING']._serialized_start=2280
+  _globals['_SIGHTING']._serialized_end=2329
+  _globals['_TWINSERVICE']._serialized_start=2493
+  _globals['_TWINSERVICE']._serialized_end=2824
 # @@protoc_insertion_point(module_scope)

@@ -130,6 +130,7 @@ class TwinPicture(_message.Message):
     INSTANT_FIELD_NUMBER: _builtins.int
     CAPTURE_CLOCK_FIELD_NUMBER: _builtins.int
     LOCALISATION_FIELD_NUMBER: _builtins.int
+    DECODING_NS_FIELD_NUMBER: _builtins.int
     vehicle_id: _builtins.str
     camera_id: _builtins.str
     session_id: _builtins.str
@@ -155,6 +156,8 @@ class TwinPicture(_message.Message):
     capture_clock: _edge_pb2.CaptureClock.ValueType
     """As the vehicle stated them in its frame."""
     localisation: _edge_pb2.Localisation.ValueType
+    decoding_ns: _builtins.int
+    """From the last byte of its frame to the picture."""
     @_builtins.property
     def pose(self) -> _edge_pb2.Pose: ...
     @_builtins.property
@@ -183,10 +186,11 @@ class TwinPicture(_message.Message):
         instant: _builtins.int = ...,
         capture_clock: _edge_pb2.CaptureClock.ValueType = ...,
         localisation: _edge_pb2.Localisation.ValueType = ...,
+        decoding_ns: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["intrinsics", b"intrinsics", "pose", b"pose"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ns", b"age_ns", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "encoding", b"encoding", "epoch", b"epoch", "field_id", b"field_id", "instant", b"instant", "intrinsics", b"intrinsics", "localisation", b"localisation", "payload_bytes", b"payload_bytes", "picture", b"picture", "pose", b"pose", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "sequence", b"sequence", "session_id", b"session_id", "skipped", b"skipped", "vehicle_id", b"vehicle_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ns", b"age_ns", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "decoding_ns", b"decoding_ns", "encoding", b"encoding", "epoch", b"epoch", "field_id", b"field_id", "instant", b"instant", "intrinsics", b"intrinsics", "localisation", b"localisation", "payload_bytes", b"payload_bytes", "picture", b"picture", "pose", b"pose", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "sequence", b"sequence", "session_id", b"session_id", "skipped", b"skipped", "vehicle_id", b"vehicle_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

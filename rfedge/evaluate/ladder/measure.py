@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter_ns, process_time_ns
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -102,11 +102,20 @@ def measure_rung(drive: Drive, rendered: TimedRenders, rung: Rung, crf: float) -
     return measure_frames(drive, rendered, rung, crf)[0]
 
 
+class FrameTimes(NamedTuple):
+    """Processor time of a frame, milliseconds: of both ends, of the sender until the pose is sent
+    ahead, and of the receiver's work that needs nothing but that pose."""
+
+    sender_ms: float
+    receiver_ms: float
+    located_ms: float
+    ahead_ms: float
+
+
 def measure_frames(
     drive: Drive, rendered: TimedRenders, rung: Rung, crf: float
-) -> tuple[Row, list[tuple[float, float]]]:
-    """Return what ``measure_rung`` does, and what each frame took of a processor at the sender and
-    at the receiver, in milliseconds; raises as it does."""
+) -> tuple[Row, list[FrameTimes]]:
+    """Return what ``measure_rung`` does, and the times of each frame; raises as it does."""
     sender, receiver = _Stages(SENDER_STAGES), _Stages(RECEIVER_STAGES)
     config = CodecConfig(*drive.frames[0].size_px, rung.effort, crf)
     encoder = DeltaEncoder(config, sender.clock)
@@ -141,10 +150,16 @@ def measure_frames(
         "ssim": float(np.mean([ssim(ours.y, theirs.y) for ours, theirs in pairs])),
         "references_used": _counts(coded[1:]),
     }
-    ends_ms = zip(rendered.frames_ms, sender.frames_ms(), receiver.frames_ms(), strict=True)
+    ends_ms = zip(
+        rendered.frames_ms,
+        sender.frames_ms(),
+        receiver.frames_ms(),
+        receiver.frames_ms("references"),
+        strict=True,
+    )
     return row, [
-        (render + convert + coding, render + decoding)
-        for (render, convert), coding, decoding in ends_ms
+        FrameTimes(render + convert + coding, render + decoding, convert, render + references)
+        for (render, convert), coding, decoding, references in ends_ms
     ]
 
 
@@ -162,9 +177,10 @@ class _Stages:
             raise CodecError(f"{len(spent)} stages where {', '.join(self._names)} are expected")
         self._frames.append(spent)
 
-    def frames_ms(self) -> list[float]:
-        """Return the processor time of all stages of each frame."""
-        return [sum(cpu for cpu, _ in spent) for spent in self._frames]
+    def frames_ms(self, *names: str) -> list[float]:
+        """Return the processor time of these stages of each frame; of all without names."""
+        places = [self._names.index(name) for name in names or self._names]
+        return [sum(spent[place][0] for place in places) for spent in self._frames]
 
     def quartiles(self) -> dict[str, tuple[float, float]]:
         steady = list(zip(*self._frames[1:], strict=True))

@@ -92,7 +92,9 @@ export class Wall {
       const bytes = camera.sizes.reduce((sum, [, size]) => sum + size, 0);
       const age_ms = header.age_ms + now - arrived;
       const rate = `${Math.round((8 * bytes) / KEPT_MS)} kbit/s`;
-      const facts = header.truth ? this.ofField(camera) : `age ${age(age_ms)}, ${rate}`;
+      const decoding = `${Math.round(header.decoding_ms)} ms after its last byte`;
+      const facts = header.truth ? this.ofField(camera)
+        : `age ${age(age_ms)}, decoded ${decoding}, ${rate}`;
       camera.figure.classList.toggle("late", !header.truth && age_ms > LATE_MS);
       camera.state.replaceChildren(...badges(camera));
       const mates = this.ofVehicle(camera.vehicle);
