@@ -143,6 +143,11 @@ class DriveObserver:
         self._metrics.source_frames.labels("taken").inc(taken)
         self._metrics.source_frames.labels("dropped").inc(dropped)
 
+    def source_damaged(self, camera_id: str, count: int) -> None:
+        """Count and log frames of a live source that were damaged or rest on lost ones."""
+        self._metrics.source_frames.labels("damaged").inc(count)
+        log.warning("camera pictures lost on the way", camera=camera_id, left_out=count)
+
     def _log_pose(self, result: FrameResult) -> None:
         """Log when the camera was found or lost, and how late the feed is if that changed."""
         fix = None if result.encoded is None else result.encoded.fix

@@ -145,7 +145,8 @@ class AgentMetrics:
         self.source_frames = make.counter(
             "rfedge_agent_source_frames",
             "Frames of the live source by what became of them: taken over, or dropped because a "
-            "newer one came first, the rate is lower, or their time went back.",
+            "newer one came first, the rate is lower, or their time went back, or damaged: lost on "
+            "the way, or predicted from such a one.",
             ("result",),
         )
         self.source_losses = make.counter(

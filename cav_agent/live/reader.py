@@ -6,12 +6,13 @@ along. Neither may happen to the agent, so the reader is a process of its own, w
 kill. In the agent, only the records of this module are used.
 
 One thread decodes and keeps the newest frame; the main thread converts and writes it. Frames that
-were superseded meanwhile, or are more than ``rate_hz`` asks for, are dropped before conversion.
+were superseded meanwhile, or are more than ``rate_hz`` asks for, are dropped before conversion;
+so are those that rest on lost ones (``cav_agent.live.unbroken``).
 The end of standard input ends the process: the agent is gone.
 
 A record is a header of fixed size, little-endian (magic, kind, width, height, pts, received, sent,
-dropped, length), then pixels or a text. Both ends are of one build and run on one machine. The
-header is checked nevertheless, since the other end decodes what strangers send.
+dropped, damaged, length), then pixels or a text. Both ends are of one build and run on one machine.
+The header is checked nevertheless, since the other end decodes what strangers send.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ import numpy as np
 from av.error import FFmpegError, InvalidDataError
 from av.video.codeccontext import VideoCodecContext
 
-from cav_agent.live.settings import ReaderSettings, SourceKind
+from cav_agent.live.settings import ReaderSettings, SourceAddress, SourceKind
+from cav_agent.live.unbroken import UnbrokenPictures
 from rfcore.errors import RfedgeError
 from rfcore.image import Rgb, rgb_from_video_frame
 
@@ -42,7 +44,7 @@ EARLY_SHARE = 0.3
 """Share of a period by which a frame may be too early and is still taken, since cameras jitter."""
 
 MAGIC = b"RFLV"
-FORMAT = struct.Struct("<4sIIIqqqqQ")
+FORMAT = struct.Struct("<4sIIIqqqqqQ")
 HEADER_BYTES = FORMAT.size
 FRAME, ENDED, FAILED = 1, 2, 3
 UNKNOWN = -1
@@ -56,7 +58,8 @@ class FrameRecord:
 
     ``pts_ns``: its presentation time, since the first frame of a file; ``None``: it has none.
     ``received_ns``: when it was decoded, Unix time. ``sender_ns``: when it was taken by the
-    sender's clock, Unix time, ``None`` without a report. ``dropped``: frames left out so far.
+    sender's clock, Unix time, ``None`` without a report. ``dropped``: frames left out so far;
+    ``damaged``: those of them that were damaged or rest on lost ones.
     """
 
     rgb: Rgb
@@ -64,13 +67,14 @@ class FrameRecord:
     received_ns: int
     sender_ns: int | None = None
     dropped: int = 0
+    damaged: int = 0
 
     def header(self) -> bytes:
         """Return the header; ``rgb`` follows, row by row."""
         height, width, _ = self.rgb.shape
         pts = UNKNOWN if self.pts_ns is None else self.pts_ns
         sent = UNKNOWN if self.sender_ns is None else self.sender_ns
-        times = (pts, self.received_ns, sent, self.dropped)
+        times = (pts, self.received_ns, sent, self.dropped, self.damaged)
         return FORMAT.pack(MAGIC, FRAME, width, height, *times, self.rgb.nbytes)
 
 
@@ -85,7 +89,7 @@ class EndRecord:
         """Return header and text."""
         text = self.problem.encode()[:MAX_TEXT_BYTES]
         kind = ENDED if self.is_whole else FAILED
-        return FORMAT.pack(MAGIC, kind, 0, 0, 0, 0, 0, 0, len(text)) + text
+        return FORMAT.pack(MAGIC, kind, 0, 0, 0, 0, 0, 0, 0, len(text)) + text
 
 
 Record = FrameRecord | EndRecord
@@ -101,18 +105,19 @@ class Header:
     received_ns: int
     sender_ns: int
     dropped: int
+    damaged: int
     length: int
 
     @classmethod
     def parsed(cls, data: bytes) -> Header:
         """Return the header of ``HEADER_BYTES`` bytes; raise ``RfedgeError`` if it is none."""
-        magic, kind, width, height, pts, received, sent, dropped, length = FORMAT.unpack(data)
+        magic, kind, width, height, *times, length = FORMAT.unpack(data)
         size_px = (width, height)
         is_frame = kind == FRAME and max(size_px) <= MAX_SIDE_PX and length == width * height * 3
         is_text = kind in (ENDED, FAILED) and length <= MAX_TEXT_BYTES
         if magic != MAGIC or not (is_frame or is_text):
             raise RfedgeError(f"the camera's reader sent a record of kind {kind}, {length} bytes")
-        return cls(kind, size_px, pts, received, sent, dropped, length)
+        return cls(kind, size_px, *times, length)
 
 
 def record_of(header: Header, body: bytes | bytearray) -> Record:
@@ -123,7 +128,8 @@ def record_of(header: Header, body: bytes | bytearray) -> Record:
     rgb = np.frombuffer(body, np.uint8).reshape(height, width, 3)
     pts_ns = None if header.pts_ns == UNKNOWN else header.pts_ns
     sender_ns = None if header.sender_ns == UNKNOWN else header.sender_ns
-    return FrameRecord(rgb, pts_ns, header.received_ns, sender_ns, header.dropped)
+    times = (pts_ns, header.received_ns, sender_ns)
+    return FrameRecord(rgb, *times, header.dropped, header.damaged)
 
 
 @dataclass(frozen=True)
@@ -145,7 +151,7 @@ class NewestFrame:
     """Passes the newest frame from one thread to another; ``end`` closes it."""
 
     def __init__(self) -> None:
-        self.dropped = 0
+        self.dropped = self.damaged = 0
         self._changed = Condition()
         self._decoded: Decoded | None = None
         self._end: EndRecord | None = None
@@ -157,10 +163,11 @@ class NewestFrame:
             self._decoded = decoded
             self._changed.notify()
 
-    def leave_out(self) -> None:
+    def leave_out(self, is_damaged: bool) -> None:
         """Count a frame that is left out."""
         with self._changed:
             self.dropped += 1
+            self.damaged += is_damaged
 
     def end(self, end: EndRecord) -> None:
         """Announce that no more frames come."""
@@ -186,7 +193,7 @@ def main() -> None:
     while isinstance(taken := newest.take(), Decoded):
         rgb = rgb_from_video_frame(taken.frame)
         times = (taken.pts_ns, taken.received_ns, taken.sender_ns)
-        record = FrameRecord(rgb, *times, newest.dropped)
+        record = FrameRecord(rgb, *times, newest.dropped, newest.damaged)
         _write(record.header(), rgb.data)
     _write(taken.to_bytes())
     os._exit(0)  # FFmpeg's own threads may hang with the camera
@@ -216,7 +223,7 @@ def _decode(settings: ReaderSettings, newest: NewestFrame) -> None:
             if decoded is not None and wanted.takes(decoded.time_ns):
                 newest.put(decoded)
             else:
-                newest.leave_out()
+                newest.leave_out(is_damaged=decoded is None)
         newest.end(EndRecord("the source ended", is_whole=is_file))
     except (FFmpegError, OSError, IndexError, ValueError) as error:
         newest.end(EndRecord(f"{type(error).__name__}: {error}"))
@@ -241,7 +248,8 @@ class FrameDecimator:
 
 
 def _frames(settings: ReaderSettings) -> Iterator[Decoded | None]:
-    """Yield frames as they come, ``None`` for a damaged one; those of a file when they are due."""
+    """Yield frames as they come, ``None`` for one that is damaged or rests on a lost one; those of
+    a file when they are due."""
     address = settings.address
     container = av.open(
         address.url,
@@ -253,17 +261,22 @@ def _frames(settings: ReaderSettings) -> Iterator[Decoded | None]:
     context = stream.codec_context
     if not isinstance(context, VideoCodecContext):
         raise ValueError("the source is of a codec that is not known")
-    context.thread_type = "SLICE"  # threads by frame would delay each by as many frames
+    # Threads by frame would delay each by as many frames; with threads by slice FFmpeg 8 does not
+    # flag a picture that lacks slices.
+    context.thread_count = 1
     context.flags |= av.codec.context.Flags.low_delay
+    unbroken = _unbroken(address, context)
+    period_ns = PeriodOfParser(address, context)
     sent: dict[int, int] = {}
     first_pts: int | None = None
     began_ns = time.monotonic_ns()
     for packet in container.demux(stream):
         _note_sender_time(packet, sent)
-        for frame in _decoded(packet):
-            if frame is None:
-                yield None
-                continue
+        late_ns = period_ns.of(packet)
+        left_out = unbroken.left_out
+        frames = list(_decoded(packet, unbroken))
+        yield from [None] * (unbroken.left_out - left_out)
+        for frame in frames:
             pts, tick_s = frame.pts, frame.time_base or Fraction(1, 90_000)
             if pts is not None and address.kind is SourceKind.FILE:
                 first_pts = pts if first_pts is None else first_pts
@@ -271,22 +284,61 @@ def _frames(settings: ReaderSettings) -> Iterator[Decoded | None]:
                 _sleep_until(began_ns + round(pts * tick_s * NS))
             pts_ns = None if pts is None else max(0, round(pts * tick_s * NS))
             sender_ns = None if frame.pts is None else sent.get(frame.pts)
-            yield Decoded(frame, pts_ns, time.time_ns(), sender_ns)
+            yield Decoded(frame, pts_ns, time.time_ns() - late_ns, sender_ns)
 
 
-def _decoded(packet: av.Packet[av.VideoStream]) -> Iterator[av.VideoFrame | None]:
-    """Yield a packet's frames, ``None`` where it lost some on the way: others follow.
+def _decoded(
+    packet: av.Packet[av.VideoStream], unbroken: UnbrokenPictures[av.VideoFrame]
+) -> Iterator[av.VideoFrame]:
+    """Yield the frames that came out and rest on whole ones only.
 
     A source of which nothing can be decoded is silent to the agent.
     """
+    if packet.size:
+        unbroken.packet(bytes(packet), packet.pts, packet.dts, is_flagged=packet.is_corrupt)
     try:
         frames = packet.decode()
     except InvalidDataError:
-        yield None
+        unbroken.broke()
         return
     for frame in frames:
         if isinstance(frame, av.VideoFrame):
-            yield None if frame.is_corrupt else frame
+            yield from unbroken.released(
+                frame, frame.pts, is_key=frame.key_frame, is_flagged=frame.is_corrupt
+            )
+
+
+def _unbroken(
+    address: SourceAddress, context: VideoCodecContext
+) -> UnbrokenPictures[av.VideoFrame]:
+    headers = bytes(context.extradata or b"")
+    is_stream = context.name == "h264" and not headers.startswith(b"\x01")  # 1: of an MP4
+    return UnbrokenPictures(
+        has_frame_numbers=is_stream,
+        may_lose=address.may_lose,
+        headers=headers if is_stream else b"",
+    )
+
+
+class PeriodOfParser:
+    """Tells how late a picture of the network is when FFmpeg gives it.
+
+    FFmpeg's parser knows the end of a coded picture by the beginning of the next one: at 10 Hz a
+    picture comes 100 ms after its last packet.
+    """
+
+    def __init__(self, address: SourceAddress, context: VideoCodecContext) -> None:
+        is_network = address.kind not in (SourceKind.FILE, SourceKind.V4L2)
+        self._applies = is_network and context.name in ("h264", "hevc")
+        self._last_pts: int | None = None
+
+    def of(self, packet: av.Packet[av.VideoStream]) -> int:
+        """Return nanoseconds: the time from the packet before to this one, 0 if it is not known."""
+        last, self._last_pts = self._last_pts, packet.pts
+        if not self._applies or last is None or packet.pts is None or packet.time_base is None:
+            return 0
+        period_ns = round((packet.pts - last) * packet.time_base * NS)
+        return period_ns if 0 < period_ns < NS else 0
 
 
 def _note_sender_time(packet: av.Packet[av.VideoStream], sent: dict[int, int]) -> None:

@@ -60,6 +60,13 @@ class SourceAddress:
     format: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def may_lose(self) -> bool:
+        """Return whether packets may be lost on the way."""
+        if self.kind is SourceKind.RTSP:
+            return self.options.get("rtsp_transport") == RtspTransport.UDP
+        return self.kind in (SourceKind.RTP, SourceKind.MPEG_TS, SourceKind.SDP)
+
 
 def parse_address(text: str) -> SourceAddress:
     """Return the parsed address; raise ``InvalidInput`` naming what is expected."""

@@ -213,6 +213,9 @@ class SourceObserver(Protocol):
     def source_frames(self, taken: int, dropped: int) -> None:
         """Count frames that were taken over, or dropped before they were coded."""
 
+    def source_damaged(self, camera_id: str, count: int) -> None:
+        """Count frames that were left out since they were damaged or rest on lost ones."""
+
 
 @dataclass(frozen=True)
 class Clocks:
@@ -253,7 +256,7 @@ class LiveSource:
         self._clock = CaptureClock()
         self._kind: ClockKind | None = None
         self._heard_s = self._retry_at_s = self._clocks.monotonic_s()
-        self._dropped = 0
+        self._dropped = self._damaged = 0
         self._is_lost = False
         self.is_over = False
         """Whether a file came to its end, once its last frame was taken."""
@@ -293,7 +296,7 @@ class LiveSource:
     def _open(self, now: float) -> None:
         self._clock = CaptureClock(self._clock.last_ns)
         self._kind = None
-        self._dropped = 0
+        self._dropped = self._damaged = 0
         self._heard_s = now
         try:
             self._reader = self._open_reader()
@@ -327,7 +330,10 @@ class LiveSource:
             self._lose(SourceProblem.WRONG_SIZE, text)
             return
         self._heard_s = now
-        dropped, self._dropped = record.dropped - self._dropped, record.dropped
+        damaged, self._damaged = record.damaged - self._damaged, record.damaged
+        dropped, self._dropped = record.dropped - self._dropped - damaged, record.dropped
+        if damaged:
+            self._observer.source_damaged(self._camera_id, damaged)
         stamp = self._clock.stamp(record.pts_ns, record.received_ns, record.sender_ns)
         if stamp is None:
             self._observer.source_frames(0, dropped + 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import socket
@@ -19,6 +20,11 @@ from typing import Any
 import grpc
 import pytest
 
+from cav_agent.live.reader import FrameRecord
+from cav_agent.live.settings import ReaderSettings, parse_address
+from cav_agent.live.source import ReaderProcess
+from rfcore.image import read_rgb
+from rfcore.metrics import psnr
 from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
 
 pytestmark = [pytest.mark.slow, pytest.mark.sample, pytest.mark.timeout(300)]
@@ -169,6 +175,52 @@ def test_an_rtp_stream_by_its_sdp_file(run: Any, sender: Any, tmp_path: Path) ->
     driving = run(str(tmp_path / "camera.sdp"))
     lives_through(driving, camera, kills=1, frames=25)
     assert "sender_report" in clocks_of(driving)
+
+
+class LosingRelay:
+    """Passes UDP from one port on to another, but for each so many-th datagram."""
+
+    def __init__(self, source: int, target: int, lose_every: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", source))
+        self._target = ("127.0.0.1", target)
+        self._lose_every = lose_every
+        threading.Thread(target=self._pass_on, daemon=True).start()
+
+    def _pass_on(self) -> None:
+        with suppress(OSError):
+            for number in itertools.count(1):
+                data = self._socket.recv(65536)
+                if number % self._lose_every:
+                    self._socket.sendto(data, self._target)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def test_pictures_that_rest_on_lost_packets_are_not_passed_on(
+    sender: Any, live_camera: Path, free_port: int
+) -> None:
+    """Each 1501st RTP packet is lost, one in four groups of ten pictures."""
+    target = free_port + 2 if free_port < 60000 else free_port - 2
+    (live_camera / "camera.sdp").write_text(SDP.format(port=target))
+    originals = [read_rgb(path) for path in sorted(live_camera.glob("*.jpg"))]
+    address = parse_address(str(live_camera / "camera.sdp"))
+    relay = LosingRelay(free_port, target, lose_every=1501)
+    reader = ReaderProcess(ReaderSettings(address, 10.0, 30.0))
+    seen, end_s = [], time.monotonic() + 120
+    try:
+        sender("rtp")
+        while len(seen) < 80 or not seen[-1].damaged:
+            record = reader.read(10.0)
+            assert isinstance(record, FrameRecord)
+            assert time.monotonic() < end_s
+            seen.append(record)
+    finally:
+        reader.close()
+        relay.close()
+    worst_db = min(max(psnr(frame.rgb, original) for original in originals) for frame in seen)
+    assert worst_db > 27, "those after a lost packet have 18 to 20 dB"
 
 
 @pytest.mark.nightly

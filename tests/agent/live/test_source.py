@@ -7,7 +7,7 @@ from collections import Counter, deque
 import numpy as np
 import pytest
 
-from cav_agent.live.reader import EndRecord, FrameRecord, Header, Record, record_of
+from cav_agent.live.reader import HEADER_BYTES, EndRecord, FrameRecord, Header, Record, record_of
 from cav_agent.live.source import LONGEST_PAUSE_S, OPENING_S, Clocks, LiveSource, SourceProblem
 from rfcore.errors import RfedgeError
 from rfcore.wire.values import ClockKind
@@ -48,6 +48,11 @@ class World:
         self.counts["lost"] += 1
         if begins:
             self.events.append(("lost", problem))
+
+    def source_damaged(self, camera_id: str, count: int) -> None:
+        assert camera_id == "front"
+        assert count > 0
+        self.counts["damaged"] += count
 
     def source_frames(self, taken: int, dropped: int) -> None:
         self.counts["taken"] += taken
@@ -198,17 +203,19 @@ def sent(record: FrameRecord) -> bytes:
 def test_records_survive_the_pipe() -> None:
     record = FrameRecord(frame(1.2).rgb, None, BEGAN, BEGAN - 5, 7)
     data = sent(record)
-    back = record_of(Header.parsed(data[:56]), data[56:])
+    back = record_of(Header.parsed(data[:HEADER_BYTES]), data[HEADER_BYTES:])
     assert isinstance(back, FrameRecord)
     assert np.array_equal(back.rgb, record.rgb)
     assert (back.pts_ns, back.sender_ns, back.dropped) == (None, BEGAN - 5, 7)
     text = EndRecord("gone: ü", is_whole=True).to_bytes()
-    assert record_of(Header.parsed(text[:56]), text[56:]) == EndRecord("gone: ü", is_whole=True)
+    assert record_of(Header.parsed(text[:HEADER_BYTES]), text[HEADER_BYTES:]) == EndRecord(
+        "gone: ü", is_whole=True
+    )
 
 
-@pytest.mark.parametrize("at", [0, 4, 8, 12, 48, 55])
+@pytest.mark.parametrize("at", [0, 4, 8, 12, HEADER_BYTES - 8, HEADER_BYTES - 1])
 def test_a_damaged_header_is_refused(at: int) -> None:
-    data = bytearray(sent(frame(1.0))[:56])
+    data = bytearray(sent(frame(1.0))[:HEADER_BYTES])
     data[at] ^= 0x40
     with pytest.raises(RfedgeError, match="the camera's reader sent a record"):
         Header.parsed(bytes(data))

@@ -46,6 +46,10 @@ class Events:
         assert begins or self.lost
         self.lost.append((problem, text))
 
+    def source_damaged(self, camera_id: str, count: int) -> None:
+        assert camera_id == "front"
+        assert count > 0
+
     def source_frames(self, taken: int, dropped: int) -> None:
         assert dropped >= 0
         self.taken += taken
