@@ -111,13 +111,14 @@ class Header:
     @classmethod
     def parsed(cls, data: bytes) -> Header:
         """Return the header of ``HEADER_BYTES`` bytes; raise ``RfedgeError`` if it is none."""
-        magic, kind, width, height, *times, length = FORMAT.unpack(data)
+        magic, kind, width, height, *rest = FORMAT.unpack(data)
+        pts, received, sender, dropped, damaged, length = rest
         size_px = (width, height)
         is_frame = kind == FRAME and max(size_px) <= MAX_SIDE_PX and length == width * height * 3
         is_text = kind in (ENDED, FAILED) and length <= MAX_TEXT_BYTES
         if magic != MAGIC or not (is_frame or is_text):
             raise RfedgeError(f"the camera's reader sent a record of kind {kind}, {length} bytes")
-        return cls(kind, size_px, *times, length)
+        return cls(kind, size_px, pts, received, sender, dropped, damaged, length)
 
 
 def record_of(header: Header, body: bytes | bytearray) -> Record:
