@@ -280,12 +280,13 @@ def damage_after_poses(
             reader.ahead(damaged_data(ahead, rng) if which & 1 else ahead)
         except FrameRefused as refused:
             outcomes[f"pose {refused.reason}"] += 1
-        readers[index] = reader_after(hello, before[index])  # it has learnt a damaged pose
         try:
             read = reader.frame(damaged_data(data, rng) if which & 2 else data)
         except FrameRefused as refused:
             outcomes[str(refused.reason)] += 1
+            reader._sent_ahead[0] = None
             continue
+        readers[index] = reader_after(hello, before[index])  # it has learnt the damaged frame
         assert repaired or read == whole
         made: Prediction | None = prepared[index]
         if read.pose != whole.pose:
