@@ -12,7 +12,17 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from attack.target import ROOT, SEED, VEHICLE, Target, all_of, for_ever, stream_of
+from attack.target import (
+    ROOT,
+    SEED,
+    VEHICLE,
+    Target,
+    all_of,
+    for_ever,
+    frame,
+    hello,
+    stream_of,
+)
 from cav_agent.pipeline import Pipeline
 from frames import message_of
 from mec_server.decoding.child import DECODER_NAME
@@ -21,7 +31,9 @@ from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import hello_to_bytes
+from rfcore.wire.head import FrameWriter
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
+from rfcore.wire.v1.edge_pb2 import StreamRequest
 
 ATTACKERS_CRF = 24.0
 """No other vehicle of the suite codes so, and no slice of theirs is equal to one of the attacker's.
@@ -60,6 +72,73 @@ async def flipped_slices(target: Target) -> None:
             captured_ns = time.time_ns()
             yield message_of(greeting, replace(good, packet=packet, capture_time_ns=captured_ns))
             await asyncio.sleep(0.02)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, messages())
+
+    await for_ever(stream, 0.05)
+
+
+async def poses_for_nothing(target: Target) -> None:
+    """Poses ahead of frames that never come, of one camera, as fast as the server takes them."""
+    await _poses(target, hello(target, 640, 360))
+
+
+async def poses_of_large_renders(target: Target) -> None:
+    """Poses ahead of frames that never come, of 4 cameras of 1920x1080."""
+    await _poses(target, hello(target, 1920, 1080, cameras=4))
+
+
+async def _poses(target: Target, greeting: Hello) -> None:
+    writer = FrameWriter(greeting)
+
+    async def messages() -> AsyncIterator[bytes]:
+        yield hello_to_bytes(greeting)
+        await asyncio.sleep(0.5)  # before Welcome they are of no use
+        for sequence in range(1, 1_000_000):
+            for camera in greeting.cameras:
+                one = replace(frame(sequence), camera_id=camera.camera_id)
+                yield writer.ahead(one.ahead, None)
+            await asyncio.sleep(0)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, messages())
+
+    await for_ever(stream, 0.05)
+
+
+async def poses_of_other_places(target: Target) -> None:
+    """Pictures of the street, each after a pose of another place: it is rendered twice."""
+    greeting, good = picture(target)
+    away = replace(good.pose, translation_m=(good.pose.translation_m[0] + 5.0, 0.0, 1.5)).rounded()
+
+    async def messages() -> AsyncIterator[bytes]:
+        yield hello_to_bytes(greeting)
+        for sequence in range(100_000):
+            packet = replace(good.packet, epoch=1, sequence=sequence)
+            shown = replace(good, packet=packet, capture_time_ns=time.time_ns())
+            yield FrameWriter(greeting).ahead(replace(shown, pose=away).ahead, None)
+            await asyncio.sleep(0.02)
+            yield message_of(greeting, shown)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, messages())
+
+    await for_ever(stream, 0.05)
+
+
+async def junk_poses(target: Target) -> None:
+    """Poses of random bytes."""
+    greeting, rng = hello(target, 640, 360), random.Random(SEED)
+
+    async def messages() -> AsyncIterator[bytes]:
+        yield hello_to_bytes(greeting)
+        while True:
+            junk = rng.randbytes(rng.randrange(1, 40))
+            yield StreamRequest(pose_ahead=junk).SerializeToString()
 
     async def stream() -> None:
         async with target.channel() as channel:
