@@ -101,9 +101,9 @@ class AgentConfig:
     dropped when the lowest quality cannot. Without it every frame has --crf."""
     fetch_share: float = 0.5
     """Share of the link that fetching a field may take while pictures are sent, 0.05 to 1."""
-    pose_ahead: bool = True
-    """Send where a picture was taken before it is coded, and have the server render meanwhile, as
-    long as that shows pictures sooner."""
+    pose_with_frame: bool = False
+    """Send poses with their frames alone. Otherwise they go ahead, so that the server renders while
+    the vehicle codes, as long as that shows pictures sooner."""
     deadline_ms: float | None = None
     """Milliseconds a frame may take on this machine, from the picture to the packet: the best rung
     of the ladder that keeps it is used, a lower one under load, in place of the effort."""

@@ -438,7 +438,7 @@ class StreamFactory:
             rate_control,
             division,
             first_epoch=first_epoch,
-            pose_ahead=self._config.pose_ahead,
+            pose_ahead=not self._config.pose_with_frame,
         )
         self._sessions.append(session)
         return session

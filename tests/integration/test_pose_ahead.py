@@ -20,7 +20,7 @@ async def test_with_poses_ahead_pictures_are_the_same_for_a_few_bytes(
     serve: Any, travel: Any
 ) -> None:
     async with serve() as server:
-        plain = await travel(server.address, pose_ahead=False)
+        plain = await travel(server.address, pose_with_frame=True)
         value = server.registry.get_sample_value
         assert value("rfedge_server_poses_ahead_total", {"result": "taken"}) == 0
         ahead = await travel(server.address)
