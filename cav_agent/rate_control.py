@@ -14,7 +14,9 @@ coded. One frame of a camera among several is too short to tell the path's rate 
 Only what fewer bytes can change is taken for the path's. An Ack says how long the server worked on
 the frame; that time is no part of the round trip. Answers may wait behind a field that the vehicle
 downloads (``own_wait_s``); that wait makes no frame late. Nor is a frame late for its bytes if an
-empty one would have been late too.
+empty one would have been late too. And however slow the processors at both ends are, bytes have
+``PATH_SHARE`` of the delay: slow ends do not make frames small. What an end takes is the median of
+its last frames, so one slow frame changes nothing.
 
 ``BitDivision`` divides the bytes of an instant among the cameras of a rig, so that quality is even.
 A slice of complexity c takes about c 2^(-CRF / 6) bytes. So all cameras come out at one CRF when
@@ -32,6 +34,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from statistics import median
 
 from cav_agent.path_estimator import PathEstimator
 from rfcore.errors import InvalidInput
@@ -39,6 +42,10 @@ from rfcore.wire.messages import FrameAddress
 
 SHARE = 0.75
 """Share of the delay that is aimed at; the rest is a margin for frames, path and machine."""
+
+PATH_SHARE = 0.25
+"""Share of the delay that bytes may always use beyond the shortest round trip. When processors
+leave less, the delay is not kept: smaller frames would not make them quicker."""
 
 SUSTAINED = 0.85
 """Share of the path's rate that frames may use steadily; the rest drains queues."""
@@ -67,8 +74,9 @@ LEAST_CAMERA_SHARE = 0.25
 HALVING_CRF = 6.0
 """CRF that halves a slice (4 of CRF change the bits of a street by 60 %)."""
 
-REMEMBERED_ANSWERS = 8
-"""Answers of which the longest work of the server counts before one is called overdue."""
+REMEMBERED_FRAMES = 8
+"""Frames of which the median time counts at each end. An answer is overdue when it takes longer
+than the server's longest of them."""
 
 OVERHEAD_BYTES = 150
 """Pose, digests, gRPC and HTTP/2 framing around a slice: assumed until one was sent."""
@@ -124,13 +132,23 @@ class RateControl:
         self._path = PathEstimator(lambda a, b: _ns(own_wait_s(a / 1e9, b / 1e9)))
         self._share = 1.0
         self._cut_s = float("-inf")
-        self._work_s = self._server_s = 0.0
-        self._server_times_s: deque[float] = deque([0.0], maxlen=REMEMBERED_ANSWERS)
+        self._asked_s = float("-inf"), 0.0
+        """A time of capture, and when coding was first possible but for the path."""
+        self._work_times_s: deque[float] = deque(maxlen=REMEMBERED_FRAMES)
+        self._server_times_s: deque[float] = deque(maxlen=REMEMBERED_FRAMES)
         self._overhead_bytes = float(OVERHEAD_BYTES)
         self._interval_s: float | None = None
         self._captured_s: float | None = None
         self._instants: dict[Hashable, InstantInFlight] = {}
         self._instant_of: dict[FrameAddress, Hashable] = {}
+
+    @property
+    def _work_s(self) -> float:
+        return median(self._work_times_s) if self._work_times_s else 0.0
+
+    @property
+    def _server_s(self) -> float:
+        return median(self._server_times_s) if self._server_times_s else 0.0
 
     def captured(self, now: float) -> None:
         """Note that a picture was captured, or those of an instant."""
@@ -150,12 +168,14 @@ class RateControl:
 
         ``pictures``: how many of one instant. None while they should wait for an answer.
         """
+        if captured_s != self._asked_s[0]:
+            self._asked_s = captured_s, now
         room = self._room_bytes(captured_s, now, 1.0, 1.0, pictures)
         if self._path.bytes_in_flight and room < LEAST_BYTES * pictures:
             return None
         room = self._room_bytes(captured_s, now, SHARE, self._share, pictures)
         if self._interval_s:
-            carried = self._path.sustained_bytes(1e9 * self._interval_s, _ns(now))
+            carried = self._path.sustained_bytes(1e9 * self._interval_s, self._off_path_ns(now))
             room = min(room, SUSTAINED * carried - pictures * self._overhead_bytes)
         target = min(max(room, LEAST_BYTES * pictures), MOST_BYTES)
         return ByteBudget(target, int(LIMIT * target), self._path.rate_bps)
@@ -165,20 +185,30 @@ class RateControl:
     ) -> float:
         """Return the bytes that slices of an instant may have together to be answered in time.
 
-        In time is within ``part`` of the delay, using ``share`` of the room. Sending begins when
-        the first is coded, and the last has its part of the room.
+        In time is within ``part`` of the delay or, if that is later, after coding, without a wait
+        for the path, and ``PATH_SHARE``. ``share`` of the room is used. Sending begins when the
+        first is coded, and the last has its part of the room.
         """
-        due_ns = _ns(captured_s + part * self._max_delay_s - self._server_s)
-        now_ns = _ns(now - max(self._server_times_s))
+        work_s, delay_s = self._work_s, part * self._max_delay_s
+        way_s = min(self._path.min_rtt_ns / 1e9, self._max_delay_s / 2)
+        least_s = part * (PATH_SHARE * self._max_delay_s + way_s)
+        coded_s = self._asked_s[1] + pictures * work_s
+        due_s = max(captured_s + delay_s - self._server_s, coded_s + least_s)
         first, last = (
-            self._path.room_bytes(_ns(now + coded * self._work_s), due_ns, now_ns, share)
+            self._path.room_bytes(
+                _ns(now + coded * work_s), _ns(due_s), self._off_path_ns(now), share
+            )
             for coded in (1, pictures)
         )
         return min(first, pictures * last) - pictures * self._overhead_bytes
 
+    def _off_path_ns(self, now: float) -> int:
+        """Return when an answer that comes ``now`` left the path at the latest."""
+        return _ns(now - max(self._server_times_s, default=0.0))
+
     def coded(self, sender_s: float, payload_bytes: int, packet_bytes: int) -> None:
         """Note that a frame took the sender ``sender_s`` from the picture to the packet."""
-        self._work_s = _mean(self._work_s or None, sender_s)
+        self._work_times_s.append(sender_s)
         self._overhead_bytes = _mean(self._overhead_bytes, packet_bytes - payload_bytes)
 
     def begun(self, instant: int, pictures: int) -> None:
@@ -217,17 +247,14 @@ class RateControl:
 
         ``server_s``: how long the server worked on it, where the answer says so.
         """
-        if server_s is None:
-            server_s = self._server_s
-        self._server_s = _mean(self._server_s or None, server_s)
-        self._server_times_s.append(server_s)
+        if server_s is not None:
+            self._server_times_s.append(server_s)
         key = self._instant_of.pop(address, None)
         if key is None:
-            self._adapt(latency_s, latency_s, now)
             return
         frames = self._instants[key]
         frames.unanswered.discard(address)
-        frames.answered_s = now - server_s
+        frames.answered_s = now - (self._server_s if server_s is None else server_s)
         frames.longest_latency_s = max(frames.longest_latency_s, latency_s)
         self._close(key, frames)
 
@@ -242,29 +269,30 @@ class RateControl:
         self._close(key, frames)
 
     def _close(self, key: Hashable, frames: InstantInFlight) -> None:
-        """Learn about the path from an instant that is over."""
+        """Learn about the path from an instant that is over.
+
+        Less of the room is used from now on if it was late, and in time without the bytes, and they
+        took more than they always may.
+        """
         if not frames.is_over:
             return
         del self._instants[key]
         if frames.answered_s is None:
             return
         sample = self._path.answered(key, _ns(frames.answered_s))
-        latency_s = bytes_s = frames.longest_latency_s
+        latency_s = bytes_s = beyond_s = frames.longest_latency_s
         if sample is not None:
-            latency_s -= sample.own_ns / 1e9
-            bytes_s = (sample.rtt_ns - sample.own_ns - self._path.min_rtt_ns) / 1e9
-        self._adapt(latency_s, bytes_s, frames.answered_s)
-
-    def _adapt(self, latency_s: float, bytes_s: float, now: float) -> None:
-        """Use less of the room when a frame, or the last of an instant, was late; else more.
-
-        One that was late without the ``bytes_s`` that its bytes took says nothing.
-        """
+            own_s = sample.own_ns / 1e9
+            beyond_s = (sample.rtt_ns - self._path.min_rtt_ns) / 1e9
+            latency_s, bytes_s = latency_s - own_s, beyond_s - own_s
         if latency_s <= self._max_delay_s:
             self._share = min(1.0, self._share + GROW)
-        elif latency_s - bytes_s <= self._max_delay_s and now - latency_s >= self._cut_s:
+        elif (
+            latency_s - bytes_s <= self._max_delay_s < beyond_s / PATH_SHARE
+            and frames.answered_s - latency_s >= self._cut_s
+        ):
             self._share = max(LEAST_SHARE, SHRINK * self._share)
-            self._cut_s = now
+            self._cut_s = frames.answered_s
 
 
 class BitDivision:

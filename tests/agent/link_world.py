@@ -40,6 +40,7 @@ class ModelCoder:
     spread: float
     random: Random = field(default_factory=lambda: Random(5))
     sequences: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    slow_s: dict[int, float] = field(default_factory=dict)
 
     def __call__(self, job: EncodeJob) -> EncodedFrame:
         camera_id = job.capture.camera_id
@@ -53,7 +54,8 @@ class ModelCoder:
         sequence, payload = self.sequences[camera_id], bytes(size_bytes)
         packet = DeltaPacket(job.epoch, sequence, b"rr", b"", b"digest", payload)
         self.sequences[camera_id] += 1
-        return EncodedFrame(packet, {"encode": self.coding_s}, Pose.identity(), crf=crf)
+        coding_s = self.slow_s.get(sequence, self.coding_s)
+        return EncodedFrame(packet, {"encode": coding_s}, Pose.identity(), crf=crf)
 
 
 @dataclass
@@ -99,8 +101,11 @@ class Download:
 class World:
     """A session, a coder and an uplink, and a server that answers after ``answering_s``.
 
-    That is a time, or two between which it is drawn; the latter is said in the Ack. Answers come
-    by ``downlink``, if there is one, and so does a field.
+    That is a time, or two between which it is drawn; the latter is said in the Ack, with the wait
+    for the frames before. Answers come
+    by ``downlink``, if there is one, and so does a field. ``taken_s`` returns how long an answer
+    then waits for the vehicle's processor. ``slow_s``: what the server takes longer for frames, by
+    sequence number.
     """
 
     session: AgentSession
@@ -109,6 +114,10 @@ class World:
     answering_s: float | tuple[float, float]
     downlink: Link[object] | None = None
     download: Download | None = None
+    taken_s: Callable[[], float] = lambda: 0.0
+    slow_s: dict[int, float] = field(default_factory=dict)
+    answered_s: float = 0.0
+    taken_at_s: float = 0.0
 
     def drive(
         self, instants: Sequence[tuple[Capture, ...]], begun: Callable[[], None] = lambda: None
@@ -156,7 +165,8 @@ class World:
                     self.session.receive(event, now)
             job = self.session.job_to_start(now)
             if job is not None:
-                heapq.heappush(events, (now + self.code.coding_s, next(order), self.code(job)))
+                encoded = self.code(job)
+                heapq.heappush(events, (now + encoded.sender_s, next(order), encoded))
             for at_s, answer in self._send(now):
                 heapq.heappush(events, (at_s, next(order), answer))
             ended += self.session.take_results()
@@ -169,11 +179,16 @@ class World:
             assert isinstance(frame, Frame)
             address, packet = frame.address, frame.packet
             size_bytes = len(packet.payload) + HEADER_BYTES
-            answering_s, times = self.answering_s, StageTimes()
-            if isinstance(answering_s, tuple):
-                answering_s = self.code.random.uniform(*answering_s)
-                times = StageTimes(total_ns=round(1e9 * answering_s))
-            at_s = self.uplink.push(address, size_bytes, now).due_s + answering_s
+            arrived_s, times = self.uplink.push(address, size_bytes, now).due_s, StageTimes()
+            if isinstance(self.answering_s, tuple):
+                begun_s = max(self.answered_s, arrived_s)
+                took_s = self.code.random.uniform(*self.answering_s)
+                took_s += self.slow_s.get(address.sequence, 0.0)
+                at_s = self.answered_s = begun_s + took_s
+                times = StageTimes(total_ns=round(1e9 * (at_s - arrived_s)))
+            else:
+                at_s = arrived_s + self.answering_s
+            at_s = self.taken_at_s = max(self.taken_at_s, at_s + self.taken_s())
             ack = Ack(address, times, packet.reconstruction_digest)
             credit = Credit(address.camera_id, address.sequence + 3)
             if self.downlink is None:

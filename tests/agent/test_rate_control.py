@@ -3,7 +3,10 @@
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -194,6 +197,65 @@ def test_what_can_never_be_in_time_is_still_sent_small(
 def test_a_delay_that_cannot_be_is_refused(max_delay_s: float) -> None:
     with pytest.raises(InvalidInput, match=r"max_delay: .* outside 10..60000 ms"):
         RateControl(max_delay_s)
+
+
+# --- processors are not the link
+
+IDLE = LinkProfile(100e6, 0.005, 2**40)
+
+
+def drive_with(
+    hello: Hello,
+    make_capture: Callable[..., Capture],
+    coder: ModelCoder,
+    answering_s: tuple[float, float],
+    **world: Any,
+) -> list[Picture]:
+    """Drive for 30 s over an idle link within 200 ms."""
+    session = AgentSession(hello, rate_control=RateControl(0.2))
+    captures = [(make_capture(i, i / RATE_HZ),) for i in range(30 * RATE_HZ)]
+    results = World(session, Link(IDLE), coder, answering_s, **world).drive(captures)
+    return list(map(_picture, results))
+
+
+@pytest.mark.parametrize(("coding_s", "answering_s"), [(0.12, 0.06), (0.19, 0.19), (0.03, 0.4)])
+def test_slow_processors_lower_no_quality(
+    hello: Hello, make_capture: Callable[..., Capture], coding_s: float, answering_s: float
+) -> None:
+    coder = ModelCoder({"front": BYTES_AT_LOWEST}, coding_s, spread=0.3)
+    answering = (0.8 * answering_s, 1.2 * answering_s)
+    pictures = drive_with(hello, make_capture, coder, answering)
+    coded = [p.crf for p in between(pictures, SETTLING_S, 30) if p.crf is not None]
+    assert len(coded) > 50
+    assert max(coded) == LOWEST_CRF
+
+
+@pytest.mark.parametrize("at_server", [False, True])
+def test_a_single_late_frame_costs_no_quality(
+    hello: Hello, make_capture: Callable[..., Capture], at_server: bool
+) -> None:
+    """It takes 1.1 s in the processor of one of the ends."""
+    slow = {100: 1.1}
+    coder = ModelCoder({"front": BYTES_AT_LOWEST}, CODING_S, 0.3, slow_s={} if at_server else slow)
+    answering = ANSWERING_S, ANSWERING_S
+    slow_server = slow if at_server else {}
+    pictures = drive_with(hello, make_capture, coder, answering, slow_s=slow_server)
+    late = [p for p in pictures if p.delay_s is not None and p.delay_s > 1]
+    assert late
+    after_s = max(p.captured_s + (p.delay_s or 0) for p in late)
+    assert crf_of(between(pictures, after_s, 30)) == LOWEST_CRF
+
+
+def test_answers_that_wait_for_the_processor_lower_no_quality(
+    hello: Hello, make_capture: Callable[..., Capture]
+) -> None:
+    """The agent cannot tell this wait from the link's: 2 to 28 ms beside six busy loops on two
+    cores."""
+    random = Random(3)
+    coder = ModelCoder({"front": BYTES_AT_LOWEST}, 0.12, spread=0.3)
+    waits = partial(random.uniform, 0.002, 0.03)
+    pictures = drive_with(hello, make_capture, coder, (0.05, 0.09), taken_s=waits)
+    assert crf_of(between(pictures, SETTLING_S, 30)) <= LOWEST_CRF + 1
 
 
 # --- the division of an instant's bytes among cameras
