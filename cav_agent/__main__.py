@@ -10,6 +10,7 @@ import structlog
 
 from cav_agent.config import AgentConfig
 from cav_agent.vehicle import Vehicle
+from rfcore.errors import RfedgeError
 from rfcore.program import run_program, service_options
 
 
@@ -23,12 +24,17 @@ def _run() -> None:
 
 
 async def drive(config: AgentConfig) -> None:
-    """Drive to the end, or until SIGTERM or SIGINT."""
+    """Drive to the end, or until SIGTERM or SIGINT.
+
+    Raises ``RfedgeError`` if no picture was acknowledged.
+    """
     vehicle = Vehicle(config)
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, vehicle.stop)
     counts = await vehicle.run()
     structlog.get_logger().info("drive ended", **counts)
+    if not counts["acked"]:
+        raise RfedgeError(vehicle.explanation)
 
 
 if __name__ == "__main__":

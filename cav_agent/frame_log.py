@@ -7,13 +7,15 @@ counted when they have ended, however they ended.
 from __future__ import annotations
 
 import json
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from statistics import median
 from typing import Any, TextIO
 
 import structlog
 
 from cav_agent.deadline import DeadlineController, Step
-from cav_agent.frames import FrameResult, Outcome, RetryReason
+from cav_agent.frames import EndReason, FrameResult, Outcome, RetryReason
 from cav_agent.handover import HandoverCause, ServedTile
 from cav_agent.live.source import SourceProblem
 from cav_agent.metrics import AgentMetrics
@@ -32,12 +34,81 @@ LOGGED_CRF = 4.0
 LOGGED_OFFSET_S = 0.1
 """A change of the pose feed's time offset by less is not logged."""
 
+_LINK_REMEDY = "look at the server's log, and whether the link carries anything"
+_REMEDIES: dict[str, str] = {
+    EndReason.SUPERSEDED: "a lower --rate, smaller pictures or --effort fast",
+    EndReason.TOO_LATE: "a higher --max-delay-ms, a lower --rate or --effort fast",
+    EndReason.STOPPING: "let it drive longer",
+    EndReason.NOT_CODED: "correct the drive or the field",
+    EndReason.OVERSIZE: "smaller pictures or a higher --crf",
+    EndReason.NO_WELCOME: _LINK_REMEDY,
+    EndReason.NO_ANSWER: _LINK_REMEDY,
+    EndReason.STREAM_LOST: _LINK_REMEDY,
+    EndReason.SERVER_CLOSED: _LINK_REMEDY,
+}
+"""What helps when no picture was acknowledged, by the reason of most; of others a server refused
+them."""
+
+JUDGED_FRAMES = 8
+"""Answers of which the median time says whether the processors can keep the delay."""
+
+KEPT_SHARE = 0.9
+"""Share of the delay below which it counts as kept again."""
+
+
+class DelayWatch:
+    """Logs once that processors, not the link, take longer than ``max_delay_ms``, and its end."""
+
+    def __init__(self, max_delay_ms: float) -> None:
+        self._max_delay_ms = max_delay_ms
+        self._frames: deque[dict[str, float]] = deque(maxlen=JUDGED_FRAMES)
+        self._is_exceeded = False
+
+    def acked(self, result: FrameResult) -> None:
+        """Take a frame that was answered."""
+        if result.latency_s is None or result.link_s is None or result.server is None:
+            return
+        stage_ms = {stage: 1e3 * spent_s for stage, spent_s in result.stage_s.items()}
+        stage_ms.pop("read", None)
+        latency_ms, link_ms = 1e3 * result.latency_s, 1e3 * result.link_s
+        server_ms = result.server.total_ns / 1e6
+        vehicle_ms = latency_ms - link_ms - server_ms
+        waited_ms = vehicle_ms - sum(stage_ms.values())
+        ends = {"all": latency_ms, "link": link_ms, "server": server_ms, "vehicle": vehicle_ms}
+        self._frames.append(ends | {"wait": waited_ms} | stage_ms)
+        if len(self._frames) == JUDGED_FRAMES:
+            self._judge({key: median(f.get(key, 0.0) for f in self._frames) for key in ends})
+
+    def _judge(self, took_ms: dict[str, float]) -> None:
+        limit_ms, link_ms = self._max_delay_ms, took_ms["link"]
+        if took_ms["all"] > limit_ms and link_ms < limit_ms / 2 and not self._is_exceeded:
+            self._is_exceeded = True
+            stages = set[str]().union(*self._frames) - set(took_ms)
+            stage_ms = {s: median(f.get(s, 0.0) for f in self._frames) for s in stages}
+            longest = sorted(stage_ms, key=lambda s: -stage_ms[s])[:3]
+            vehicle = ", ".join(f"{stage} {stage_ms[stage]:.0f}" for stage in longest)
+            log.warning(
+                "processors exceed --max-delay-ms",
+                problem=f"{took_ms['all']:.0f} ms a frame, {limit_ms:g} asked for: vehicle "
+                f"{took_ms['vehicle']:.0f} ({vehicle}), server {took_ms['server']:.0f}, link "
+                f"{link_ms:.0f}; quality is not lowered for it",
+                remedy="a lower --rate, smaller pictures, --effort fast, or a higher --max-delay-ms"
+                if took_ms["vehicle"] > took_ms["server"]
+                else "fewer frames for the server (a lower --rate), smaller pictures, more "
+                "processors there, or a higher --max-delay-ms",
+            )
+            self._frames.clear()
+        elif took_ms["all"] < KEPT_SHARE * limit_ms and self._is_exceeded:
+            self._is_exceeded = False
+            log.info("--max-delay-ms is kept again", frame_ms=round(took_ms["all"]))
+            self._frames.clear()
+
 
 class DriveObserver:
     """Turns the events of a drive into metrics, log lines and, if given, the frame log.
 
     ``frame_log``: a file that gets a line of JSON per picture. ``notice_takers`` are called with
-    each notice of the street.
+    each notice of the street. ``max_delay_ms``: what the drive's frames may take, if it is limited.
     """
 
     def __init__(
@@ -46,11 +117,15 @@ class DriveObserver:
         servers: Sequence[Address],
         frame_log: TextIO | None = None,
         notice_takers: Sequence[Callable[[StreetNotice], None]] = (),
+        max_delay_ms: float | None = None,
     ) -> None:
         self._metrics = metrics
+        self._delay_watch = None if max_delay_ms is None else DelayWatch(max_delay_ms)
         self._notice_takers = tuple(notice_takers)
         self._servers = tuple(servers)
         self._frame_log = frame_log
+        self._unacknowledged: Counter[tuple[str, str]] = Counter()
+        self._problem = ""
         self._logged_crf: float | None = None
         self._pose_state: LocalisationState | None = None
         self._feed_offset_s: float | None = None
@@ -58,11 +133,26 @@ class DriveObserver:
     def ended(self, result: FrameResult) -> None:
         """A captured picture came to its end."""
         self._metrics.ended(result)
+        if result.outcome is not Outcome.ACKED:
+            self._unacknowledged[str(result.outcome), str(result.reason)] += 1
+            self._problem = result.problem or self._problem
         self._log_pose(result)
         if self._frame_log is not None:
             self._frame_log.write(json.dumps(log_line(result)) + "\n")
         _log_failure(result)
         self._log_quality(result)
+        if self._delay_watch is not None:
+            self._delay_watch.acked(result)
+
+    def explanation(self) -> str:
+        """Return why no picture of a drive was acknowledged, and what to do."""
+        if not self._unacknowledged:
+            return "no picture was taken: let it drive longer, and see above what it waited for"
+        counts = self._unacknowledged.most_common()
+        ends = ", ".join(f"{count} {outcome} ({reason})" for (outcome, reason), count in counts)
+        problem = f"; last problem: {self._problem}" if self._problem else ""
+        remedy = _REMEDIES.get(counts[0][0][1], "see the server's log for what it refused")
+        return f"no picture was acknowledged: {ends}{problem}; what helps: {remedy}"
 
     def connected(self, is_connected: bool) -> None:
         """A server welcomed the vehicle, or its stream was lost."""

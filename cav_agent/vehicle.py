@@ -119,6 +119,13 @@ class Vehicle:
         self._stopped = asyncio.Event()
         self._live: LiveCameras | None = None
         self._own_field: OwnField | None = None
+        self._observer: DriveObserver | None = None
+
+    @property
+    def explanation(self) -> str:
+        """Why no picture was acknowledged, and what to do, after a drive without an Ack."""
+        assert self._observer is not None
+        return self._observer.explanation()
 
     def stop(self) -> None:
         """Finish the frame in flight, then end."""
@@ -153,7 +160,9 @@ class Vehicle:
             frame_log = stack.enter_context(config.report.open("w", buffering=1))
         addresses = [server.address for server in self._servers]
         takers = await self._notice_takers(stack)
-        observer = DriveObserver(self._metrics, addresses, frame_log, takers)
+        self._observer = observer = DriveObserver(
+            self._metrics, addresses, frame_log, takers, config.max_delay_ms
+        )
         cameras: VehicleCameras
         if recorded is None:
             cameras = self._live = await self._open_live(stack, rig, observer, changed)

@@ -76,6 +76,36 @@ def acked(
     )
 
 
+# --- the delay that processors take
+
+
+def test_processors_that_exceed_the_delay_are_logged_once_until_they_keep_it(
+    metrics: AgentMetrics, acked: FrameResult
+) -> None:
+    observer = DriveObserver(metrics, ADDRESSES, max_delay_ms=70)
+    with capture_logs() as log:
+        for latency_s, frames in [(0.05, 20), (0.08, 40), (0.05, 20), (0.08, 20)]:
+            for _ in range(frames):
+                observer.ended(replace(acked, latency_s=latency_s, link_s=0.01))
+    exceeded, kept, again = [entry for entry in log if "max-delay" in entry["event"]]
+    assert "80 ms" in exceeded["problem"]
+    assert "server 6" in exceeded["problem"]
+    assert "--rate" in exceeded["remedy"]
+    assert kept["frame_ms"] == 50
+    assert again["event"] == exceeded["event"]
+
+
+@pytest.mark.parametrize(("latency_s", "link_s"), [(0.08, 0.06), (0.06, 0.01)])
+def test_a_link_that_exceeds_the_delay_is_not_called_a_processor(
+    metrics: AgentMetrics, acked: FrameResult, latency_s: float, link_s: float
+) -> None:
+    observer = DriveObserver(metrics, ADDRESSES, max_delay_ms=70)
+    with capture_logs() as log:
+        for _ in range(40):
+            observer.ended(replace(acked, latency_s=latency_s, link_s=link_s))
+    assert not [entry for entry in log if "max-delay" in entry["event"]]
+
+
 # --- a line per picture
 
 

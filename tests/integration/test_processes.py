@@ -83,6 +83,25 @@ async def test_an_agent_told_to_stop_finishes_its_frame_and_ends_cleanly(
     assert set(results(report)) <= {"acked", "dropped"}, "nothing that was encoded was lost"
 
 
+async def test_a_drive_without_an_acknowledged_picture_is_one_line_and_exit_2(
+    street: Any, tmp_path: Path
+) -> None:
+    drive = tmp_path / "drive"
+    shutil.copytree(street.drive, drive)
+    for picture in drive.rglob("*.png"):
+        picture.write_bytes(picture.read_bytes()[:100])
+    with server_process(street, tmp_path) as server:
+        arguments = agent_arguments(street, server.address, tmp_path / "report.jsonl")
+        arguments[arguments.index("lockstep")] = "realtime"
+        arguments[arguments.index("--drive") + 1] = str(drive)
+        agent = await start("cav_agent", *arguments)
+        _, told = await agent.communicate()
+    assert agent.returncode == 2, told.decode()[-1500:]
+    (line,) = [line for line in told.decode().splitlines() if not line.startswith("{")]
+    assert line.startswith("cav-agent: no picture was acknowledged: ")
+    assert "what helps: " in line
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -100,7 +119,7 @@ async def test_a_users_mistake_is_one_line_and_exit_2(
     agent = await start("cav_agent", *arguments)
     _, told = await agent.communicate()
     lines = [line for line in told.decode().splitlines() if not line.startswith("{")]
-    assert agent.returncode == 2
+    assert agent.returncode == 2, told.decode()[-1500:]
     assert len(lines) == 1
     assert lines[0].startswith("cav-agent: ")
     assert named in lines[0]
