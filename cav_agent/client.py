@@ -330,7 +330,7 @@ class StreamClient:
         self._times_taken = self._times_taken + 1 if is_taken else 0
         if self._times_taken >= CAMERA_TAKEN_TRIES:
             raise CameraTaken(details) from error
-        self._retry_after_s = retry_after_s(error)
+        self._retry_after_s = retry_after_s(error.trailing_metadata())
         return StreamEnd(EndReason.STREAM_LOST, f"{error.code().name}: {details}")
 
     async def _read(self, stream: Stream) -> None:

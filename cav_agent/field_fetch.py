@@ -274,7 +274,7 @@ class Transfer:
                         f"field {self.field_id} does not arrive ({problem})"
                     ) from error
                 log.warning("field transfer interrupted", problem=error.details())
-                await asyncio.sleep(retry_after_s(error))
+                await asyncio.sleep(retry_after_s(error.trailing_metadata()))
 
     async def _receive(self) -> None:
         have_bytes = self.partial.stat().st_size if self.partial.exists() else 0

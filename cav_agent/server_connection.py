@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Iterable
 from types import TracebackType
 from typing import Self
 
@@ -188,9 +189,9 @@ def _tiles_of(listed: pb.ListFieldsResponse) -> tuple[Tile, ...]:
     return (Tile(WHOLE_STREET, check_field_id("field", listed.field_ids[0])),)
 
 
-def retry_after_s(error: grpc.aio.AioRpcError) -> float:
+def retry_after_s(trailing_metadata: Iterable[tuple[str, str | bytes]] | None) -> float:
     """Return the pause that a server asked for when it refused a call; 0: it did not say."""
-    for key, value in error.trailing_metadata():
+    for key, value in trailing_metadata or ():
         if key == RETRY_AFTER and isinstance(value, str) and value.isdecimal():
             return min(int(value) / 1e3, LONGEST_RETRY_AFTER_S)
     return 0.0

@@ -20,7 +20,8 @@ import structlog
 from numpy.typing import NDArray
 
 from cav_agent.field_fetch import fetch_field
-from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
+from cav_agent.server_connection import retry_after_s
+from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
 from rfcore.field import FieldStore
 from rfcore.perception.objects import CameraKey
 from rfcore.wire.address import ASK_AFTER_S
@@ -47,7 +48,8 @@ FIELDS_EVERY_S = 5.0
 OBJECTS_AGAIN_S = 0.5
 """Period of checks for fields to show objects of."""
 VIEW_EVERY_S = 0.25
-"""Least time between two views of a browser: a view takes the server a render and more."""
+"""Least time between two views of a browser. The next is asked for after a pause as long as the
+last took, so that views take half of the time that a server grants, also where it is slow."""
 FRESHNESS_STEP_MS = 10
 FIELD_ALONE = 255
 """Freshness of pixels that no live picture vouches for; that of others is their age in steps of the
@@ -250,8 +252,8 @@ class LiveView:
     """The view of one browser through a camera that its user moves: ``RenderStream``, asked again
     and again while it is open, at most once in ``VIEW_EVERY_S``.
 
-    A refusal is shown and ends the stream; the next viewpoint opens another. Used on the event
-    loop.
+    A refusal is shown and ends the stream. Another is opened when the server said that it may be,
+    or with the next viewpoint. Used on the event loop.
     """
 
     def __init__(
@@ -282,18 +284,28 @@ class LiveView:
 
     async def _follow(self) -> None:
         try:
-            call = twin_pb2_grpc.TwinServiceStub(self._client.channel).RenderStream()
+            while (pause_s := await self._serve()) is not None:
+                await asyncio.sleep(pause_s)
         except RfedgeError as error:
             self._refused(str(error))
-            return
+
+    async def _serve(self) -> float | None:
+        """Show views until the stream ends; return when to open another, None for never."""
+        call = twin_pb2_grpc.TwinServiceStub(self._client.channel).RenderStream()
         try:
-            await self._ask(call)
-        except grpc.aio.AioRpcError as error:
-            self._refused(str(error.details()))
-        except asyncio.InvalidStateError:
-            self._refused(await call.details())
-        except (ProtocolError, InvalidInput) as error:
-            self._refused(str(error))
+            with suppress(grpc.aio.AioRpcError, asyncio.InvalidStateError):
+                await self._ask(call)
+            if self._wanted is None:
+                return None
+            after_s = retry_after_s(await call.trailing_metadata())
+            problem = await call.details() or "the server ended the stream"
+            self._refused(
+                f"the server draws no more for you at the moment; asked again in {after_s:.1f} s "
+                f"({problem})"
+                if after_s
+                else problem
+            )
+            return after_s or None
         finally:
             call.cancel()
 
@@ -303,12 +315,12 @@ class LiveView:
             await call.write(twin_pb2.RenderStreamRequest(view=view_request_to_wire(request)))
             response = await call.read()
             if response is grpc.aio.EOF:
-                self._refused(await call.details() or "the server ended the stream")
                 return
+            took_s = self._clock() - asked_s
             intrinsics = request.camera.intrinsics
             view = rendered_view_from_wire(response.view, intrinsics)
             self._send(await asyncio.to_thread(view_message, view, self._clock()))
-            await asyncio.sleep(max(0.0, VIEW_EVERY_S - (self._clock() - asked_s)))
+            await asyncio.sleep(max(took_s, VIEW_EVERY_S - took_s))
 
     def _refused(self, problem: str) -> None:
         self._send(Message({"kind": "view_refused", "problem": problem}, self._clock()))

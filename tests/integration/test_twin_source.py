@@ -1,8 +1,10 @@
 """A browser's user gets objects and views, beside pictures, from a real server."""
 
 import asyncio
+import itertools
 import json
 import struct
+import time
 import zlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -14,8 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mec_server.ledger.budgets import Limit
 from mec_server.tile_history import Learnt, TileHistory
+from mec_server.twin.rendering import ViewService
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import LimitExceeded
 from rfcore.image import rgb_from_bytes
 from rfcore.wire.tile_manifest import Ground, VersionLabel, publish
 from rfcore.wire.twin_client import AsyncTwinClient
@@ -107,6 +112,52 @@ async def test_a_live_view_follows_its_user_says_what_is_refused_and_goes_on(
         view.look(near)
         assert (await browser.view()).header["kind"] == "view"
         view.look(None)
+
+
+async def test_a_live_view_waits_as_told_and_goes_on(
+    street: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a machine where a view takes more worker time than an identity has."""
+    view, calls = ViewService.view, itertools.count()
+
+    async def spent_at_first(*arguments: Any) -> Any:
+        if next(calls) < 2:
+            raise LimitExceeded(
+                Limit.IDENTITY_WORKER_SECONDS, "more than 1 worker seconds a second", 0.01
+            )
+        return await view(*arguments)
+
+    monkeypatch.setattr(ViewService, "view", spent_at_first)
+    async with serve() as server, following(server, tmp_path) as (source, browser):
+        live = source.open_view(browser.views.put_nowait)
+        live.look(ViewRequest(NEAR, field_id=street.field_id))
+        told = [(await browser.view()).header for _ in range(4)]
+        live.close()
+    assert [each["kind"] for each in told] == ["view_refused"] * 2 + ["view"] * 2
+    assert "asked again in 0.0 s" in told[0]["problem"]
+
+
+async def test_a_live_view_asks_for_half_of_the_time_that_views_take(
+    street: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view, spans = ViewService.view, []
+
+    async def slow(*arguments: Any) -> Any:
+        begun_s = time.monotonic()
+        await asyncio.to_thread(time.sleep, 2 * server_source.VIEW_EVERY_S)  # rendering
+        drawn = await view(*arguments)
+        spans.append((begun_s, time.monotonic()))
+        return drawn
+
+    monkeypatch.setattr(ViewService, "view", slow)
+    async with serve() as server, following(server, tmp_path) as (source, browser):
+        live = source.open_view(browser.views.put_nowait)
+        live.look(ViewRequest(NEAR, field_id=street.field_id))
+        for _ in range(3):
+            await browser.view()
+        live.close()
+    for (begun_s, ended_s), (next_s, _) in itertools.pairwise(spans):
+        assert next_s - ended_s >= 0.95 * (ended_s - begun_s)
 
 
 async def test_the_operator_sees_the_lights_of_a_tile_and_what_was_learnt(
