@@ -215,9 +215,14 @@ def watch(settings: WatchSettings, source: PictureSource) -> None:
     with ExitStack() as stack:
         folder = PictureFolder(settings.folder) if settings.folder else None
         video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
-        wait_for = stack.enter_context(waiting("a picture", _say_wait))
+        wait_for = stack.enter_context(waiting("a connection", _say_wait))
+
+        def connected(may_see: str) -> None:
+            _say("connected" + (f"; this certificate may see: {may_see}" if may_see else ""))
+            wait_for("a picture")
+
         messages = stack.enter_context(
-            closing(source.watch(settings.subscription, _say_connected, _say))
+            closing(source.watch(settings.subscription, connected, _say))
         )
         for message in messages:
             wait_for("another picture")
@@ -236,10 +241,6 @@ def watch(settings: WatchSettings, source: PictureSource) -> None:
 def _say(text: str) -> None:
     sys.stderr.write(f"rfedge watch: {text}\n")
     sys.stderr.flush()
-
-
-def _say_connected(may_see: str) -> None:
-    _say("connected" + (f"; this certificate may see: {may_see}" if may_see else ""))
 
 
 def _say_wait(what: str, waited_s: float) -> None:
@@ -302,6 +303,5 @@ def _line(message: TwinPicture | Departure) -> str:
     return (
         f"{message.vehicle_id}/{message.camera_id} {message.epoch}:{message.sequence:<6} {instant}"
         f"age {message.age_ns / 1e6:6.1f} ms, {message.decoding_ns / 1e6:.1f} since its last "
-        f"byte  {where}  "
-        f"{len(message.picture)} bytes  missed {message.skipped}"
+        f"byte  {where}  sent as {message.payload_bytes} bytes  missed {message.skipped}"
     )

@@ -337,15 +337,18 @@ class ViewService:
     def _timed(
         self, compute: Callable[[], R], answer: asyncio.Future[R]
     ) -> tuple[float, R | Exception]:
-        """Return how long the thread was busy, and the result or the error."""
+        """Return the processor time that it took, and the result or the error.
+
+        A thread that gives way to others waits for its processor: nobody pays for that.
+        """
         if answer.cancelled():
             return 0.0, asyncio.InvalidStateError("nobody waits for this")
-        started = time.monotonic()
+        started = time.thread_time()
         try:
             result: R | Exception = compute()
         except Exception as error:
             result = error
-        return time.monotonic() - started, result
+        return time.thread_time() - started, result
 
     def _composed(
         self,

@@ -12,7 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -114,15 +114,20 @@ class ConsumerStream:
     async def write(self, work: Coroutine[None, None, None]) -> bool:
         """Do ``work``, which writes a message; return whether the stream goes on."""
         writing = asyncio.create_task(work)
-        await asyncio.wait(
-            {writing, self._drained},
-            timeout=self._stalled_s,
-            return_when=asyncio.FIRST_COMPLETED,
-        )
+        try:
+            await asyncio.wait(
+                {writing, self._drained},
+                timeout=self._stalled_s,
+                return_when=asyncio.FIRST_COMPLETED,
+            )
+        except asyncio.CancelledError:  # the consumer is gone
+            await _cancelled(writing)
+            raise
         if writing.done():
             writing.result()
         elif self.is_draining:
-            writing.cancel()
+            await _cancelled(writing)
+            return False
         else:
             self.unread, self.end = writing, ConsumerEnd.SLOW
         return writing.done() and not self.is_draining
@@ -130,12 +135,20 @@ class ConsumerStream:
     async def wait(self, arrived: asyncio.Event, within_s: float | None) -> bool:
         """Wait for ``arrived`` or the draining; return whether either came ``within_s``."""
         arriving = asyncio.create_task(arrived.wait())
-        done, _ = await asyncio.wait(
-            {arriving, self._drained}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED
-        )
-        arriving.cancel()
+        try:
+            done, _ = await asyncio.wait(
+                {arriving, self._drained}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED
+            )
+        finally:
+            arriving.cancel()
         arrived.clear()
         return bool(done)
+
+
+async def _cancelled(task: asyncio.Task[None]) -> None:
+    """Cancel a task and wait until it has ended, however it does."""
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
 
 
 class ConsumerStreams:
@@ -176,6 +189,8 @@ class ConsumerStreams:
             yield stream
         except grpc.aio.AbortError:
             raise
+        except grpc.aio.InternalError:  # of a write to a consumer that is gone
+            return
         except Exception as error:
             self.failed(error)
             raise
@@ -185,7 +200,8 @@ class ConsumerStreams:
             self._metrics.ended.labels(stream.end).inc()
             self._slots.log(context).info("consumer ended", reason=str(stream.end))
         if stream.unread is not None:
-            await stream.unread  # gRPC sends no status before what is being written
+            with suppress(grpc.aio.InternalError):  # it is gone
+                await stream.unread  # gRPC sends no status before what is being written
             await context.abort(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
                 f"nothing was taken for {self._stalled_s:g} s; read faster",
@@ -507,12 +523,13 @@ class _ViewRequests:
         return request
 
     async def _read(self, requests: AsyncIterator[pb.RenderStreamRequest]) -> None:
-        async for request in requests:
-            try:
-                self._spend()
-            except RfedgeError as error:
-                self._error = error
-                return
-            self.skipped += self._newest is not None
-            self._newest = request.view
-            self._arrived.set()
+        with suppress(grpc.aio.InternalError):  # of a consumer that is gone
+            async for request in requests:
+                try:
+                    self._spend()
+                except RfedgeError as error:
+                    self._error = error
+                    return
+                self.skipped += self._newest is not None
+                self._newest = request.view
+                self._arrived.set()

@@ -112,6 +112,11 @@ def check_handshake(address: Address, tls: TlsFiles | None) -> str:
                 _check_tls(address, plain, tls)
     except TimeoutError:
         return f"{address} takes connections and says nothing: is that a mec-server?"
+    except (ssl.SSLEOFError, ConnectionResetError, BrokenPipeError):
+        return (
+            f"something listens at {address} and closes every connection at once: if that is a "
+            "proxy or `rfedge link`, is the server behind it up?"
+        )
     except OSError as error:
         return f"{address} breaks the connection off ({error.strerror or error})"
     return ""

@@ -184,11 +184,19 @@ class Utilisation:
 
 
 def limit(resources: Resources) -> str:
-    """Name the first resource above its limit, or the one nearest to it, with its utilisation."""
+    """Name the first resource above its limit, or the one nearest to it, with its utilisation.
+
+    Where other programs kept the machine busy, and the test alone would not have, these are named.
+    """
     r = resources
     machine = Utilisation(
         f"CPU of the machine, at {_percent(r.machine)}{_beside(r)}", r.machine, MACHINE_BUSY
     )
+    if r.others > OTHERS and r.machine > BUSY >= r.test:
+        return (
+            f"other programs on this machine: they took {r.others:.1f} cores of it, the test "
+            f"{_percent(r.test)} of all"
+        )
     uses = (_lag(r), *_on_one_core(r), machine, _workers(r))
     over = next((use for use in uses if use.is_over), None)
     return over.text if over is not None else f"nearest: {_fullest(uses)}"
@@ -283,7 +291,7 @@ class Verdict:
     p99_ms: float
     on_time_percent: float
     on_time_at_least_percent: float
-    fairness: float
+    fairness: float | None
     limited_by: str
 
     @property
@@ -311,7 +319,10 @@ def judge(measured: Measured, bounds: Bounds) -> Verdict:
             percent < bounds.on_time_percent,
             f"{percent:.2f} % on time, below {bounds.on_time_percent:g} %",
         ),
-        (fairness < bounds.fairness, f"fairness {fairness:.2f} below {bounds.fairness:g}"),
+        (
+            fairness is not None and fairness < bounds.fairness,
+            f"fairness {fairness or 0.0:.2f} below {bounds.fairness:g}",
+        ),
         (
             (measured.growth_mb or 0.0) > allowed_mb,
             f"memory grew {measured.growth_mb or 0.0:.1f} MB, {allowed_mb:.1f} may be",
@@ -349,8 +360,9 @@ def _percentiles(latency_ms: Sequence[float]) -> tuple[float, float]:
     return float(p50_ms), float(p99_ms)
 
 
-def _fairness(vehicles: Sequence[VehicleReport], deadline_ms: float) -> float:
-    """Return the worst vehicle's share on time over the best one's."""
+def _fairness(vehicles: Sequence[VehicleReport], deadline_ms: float) -> float | None:
+    """Return the worst vehicle's share on time over the best one's; None where there are no two, or
+    none had a picture on time."""
     shares = [vehicle.on_time(deadline_ms) / vehicle.due for vehicle in vehicles if vehicle.due]
     best = max(shares, default=0.0)
-    return min(shares) / best if best else 0.0
+    return min(shares) / best if best and len(shares) > 1 else None

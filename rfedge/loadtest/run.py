@@ -78,8 +78,8 @@ class LoadRow:
     on_time_percent: float
     on_time_at_least_percent: float
     """Lower end of the share's 95 % interval."""
-    fairness: float
-    """Share on time of the worst vehicle over that of the best."""
+    fairness: float | None
+    """Share on time of the worst vehicle over that of the best; None: nothing to compare."""
     limited_by: str
     broken: Sequence[str]
     """The bounds that were not kept."""

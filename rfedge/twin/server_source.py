@@ -50,6 +50,8 @@ OBJECTS_AGAIN_S = 0.5
 VIEW_EVERY_S = 0.25
 """Least time between two views of a browser. The next is asked for after a pause as long as the
 last took, so that views take half of the time that a server grants, also where it is slow."""
+SILENT_S = 5.0
+"""Time without an answer after which the user is told what a view waits for."""
 FRESHNESS_STEP_MS = 10
 FIELD_ALONE = 255
 """Freshness of pixels that no live picture vouches for; that of others is their age in steps of the
@@ -313,7 +315,7 @@ class LiveView:
         while (request := self._wanted) is not None:
             asked_s = self._clock()
             await call.write(twin_pb2.RenderStreamRequest(view=view_request_to_wire(request)))
-            response = await call.read()
+            response = await self._answer(call)
             if response is grpc.aio.EOF:
                 return
             took_s = self._clock() - asked_s
@@ -321,6 +323,19 @@ class LiveView:
             view = rendered_view_from_wire(response.view, intrinsics)
             self._send(await asyncio.to_thread(view_message, view, self._clock()))
             await asyncio.sleep(max(took_s, VIEW_EVERY_S - took_s))
+
+    async def _answer(self, call: Any) -> Any:
+        """Return the next answer; say so while there is none for long."""
+        reading = asyncio.ensure_future(call.read())
+        try:
+            while not (await asyncio.wait({reading}, timeout=SILENT_S))[0]:
+                self._refused(
+                    f"no view within {SILENT_S:g} s: the server draws views while a processor of "
+                    "its machine is idle, and none is; still waiting"
+                )
+            return reading.result()
+        finally:
+            reading.cancel()
 
     def _refused(self, problem: str) -> None:
         self._send(Message({"kind": "view_refused", "problem": problem}, self._clock()))

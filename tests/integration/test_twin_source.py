@@ -18,6 +18,7 @@ import pytest
 
 from mec_server.ledger.budgets import Limit
 from mec_server.tile_history import Learnt, TileHistory
+from mec_server.twin import rendering
 from mec_server.twin.rendering import ViewService
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import LimitExceeded
@@ -32,6 +33,11 @@ from rfedge.twin.server_source import FIELD_ALONE, ServerSource
 INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 NEAR = Camera(INTRINSICS, Pose.identity())
 FAR = Camera(INTRINSICS, Pose((0.0, 0.0, -40.0), (1.0, 0.0, 0.0, 0.0)))
+
+
+@pytest.fixture(autouse=True)
+def views_wait_for_no_idle_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "work_when_idle", lambda: None)
 
 
 class Browser:

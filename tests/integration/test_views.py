@@ -303,6 +303,25 @@ async def test_views_are_charged_and_limited(street: Any, serve: Any) -> None:
     assert spent > 0
 
 
+async def test_a_view_that_waits_for_a_processor_costs_nothing_meanwhile(
+    street: Any, serve: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compose = rendering.compose
+
+    def late(*arguments: Any, **options: Any) -> Any:
+        threading.Event().wait(2.0)  # others have the processors
+        return compose(*arguments, **options)
+
+    monkeypatch.setattr(rendering, "compose", late)
+    monkeypatch.setattr(rendering, "work_when_idle", lambda: None)
+    async with serve() as server, stub_of(server) as stub:
+        await stub.Render(view_request_to_wire(asked(street)))
+        spent = server.registry.get_sample_value(
+            "rfedge_server_spent_total", {"resource": "worker_seconds"}
+        )
+    assert 0 < spent < 1.0
+
+
 async def test_a_camera_that_moves_is_answered_in_order_with_the_newest(
     street: Any, serve: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

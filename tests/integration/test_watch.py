@@ -2,6 +2,7 @@
 
 import asyncio
 import doctest
+import gc
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -15,6 +16,8 @@ import pytest
 
 from live_server import consumer
 from mec_server.config import ServerBudget, SessionLimits
+from mec_server.twin import rendering
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.image import read_rgb
 from rfcore.wire.settings import MetricsSettings
@@ -23,10 +26,25 @@ from rfcore.wire.twin import (
     PictureEncoding,
     Subscription,
     TwinPicture,
+    subscription_to_wire,
     twin_message_from_wire,
 )
 from rfcore.wire.twin_client import TwinClient
+from rfcore.wire.twin_render import (
+    ObjectsRequest,
+    ViewRequest,
+    objects_request_to_wire,
+    view_request_to_wire,
+)
+from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
 from rfedge.watch import WatchSettings, watch
+
+CAMERA = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
+
+
+@pytest.fixture(autouse=True)
+def views_wait_for_no_idle_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "work_when_idle", lambda: None)
 
 
 async def next_of(call: Any) -> TwinPicture | Departure:
@@ -237,3 +255,38 @@ def test_plaintext_to_another_machine_needs_permission() -> None:
     with pytest.raises(InvalidInput, match="not a loopback address"):
         TwinClient("example.org:1")
     TwinClient("example.org:1", allow_insecure=True).close()
+
+
+async def test_consumers_that_vanish_while_they_are_written_to_leave_no_traceback(
+    serve: Any, raw_vehicle: Any, coded: Any, street: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Their connection closes while pictures, objects and views come; some have read one."""
+    problems: list[Any] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, what: problems.append(what))
+    view = ViewRequest(Camera(CAMERA, Pose.identity()), field_id=street.field_id)
+
+    async def vanish(address: str, read: int) -> None:
+        async with grpc.aio.insecure_channel(address) as channel:
+            stub = twin_pb2_grpc.TwinServiceStub(channel)
+            i420 = Subscription(encoding=PictureEncoding.I420)
+            objects = objects_request_to_wire(ObjectsRequest(field_id=street.field_id))
+            moving = stub.RenderStream()
+            calls = [stub.Watch(subscription_to_wire(i420)), stub.Objects(objects), moving]
+            await moving.write(twin_pb2.RenderStreamRequest(view=view_request_to_wire(view)))
+            for call in calls[:read]:
+                await call.read()
+
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        for number in range(12):
+            if number < len(coded.frames):
+                await vehicle.told(coded.frames[number])
+            await vanish(str(server.address), number % 4)
+        async with asyncio.timeout(30):
+            while server.registry.get_sample_value("rfedge_twin_consumers"):
+                await asyncio.sleep(0.01)
+    gc.collect()
+    await asyncio.sleep(0)
+    assert not problems
+    said = capfd.readouterr()
+    assert "Traceback" not in said.out + said.err

@@ -75,8 +75,15 @@ def test_what_others_use_is_the_limit_only_where_a_bound_was_broken():
     held = replace(run_of(vehicle(100)), resources=crowded)
     broken = replace(run_of(vehicle(90)), resources=crowded)
     assert judge(held, Bounds()).limited_by == "nearest: server's event loop, at 60 % of a core"
-    said = "CPU of the machine, at 100 %, 1.4 cores of it by others"
+    said = "other programs on this machine: they took 1.4 cores of it, the test 30 % of all"
     assert judge(broken, Bounds()).limited_by == said
+
+
+@pytest.mark.parametrize("vehicles", [[vehicle(0), vehicle(0)], [vehicle(40)], []])
+def test_where_there_is_nothing_to_compare_there_is_no_fairness(vehicles):
+    verdict = judge(run_of(*vehicles), Bounds())
+    assert verdict.fairness is None
+    assert not any("fairness" in problem for problem in verdict.broken)
 
 
 # --- the resource that is named
@@ -90,8 +97,12 @@ def test_what_others_use_is_the_limit_only_where_a_bound_was_broken():
         ({"link": 0.9}, "link of the busiest vehicle, at 90 %"),
         ({"machine": 0.97}, "CPU of the machine, at 97 %"),
         (
-            {"machine": 0.97, "others": 0.5},
+            {"machine": 0.97, "others": 0.5, "test": 0.9},
             "CPU of the machine, at 97 %, 0.5 cores of it by others",
+        ),
+        (
+            {"machine": 0.93, "others": 1.2, "test": 0.4, "workers": 0.9},
+            "other programs on this machine: they took 1.2 cores of it, the test 40 % of all",
         ),
         ({"generator": 0.9, "server_loop": 0.98}, "vehicles of the test, at 90 % of a core"),
         ({"generator_lag_ms": 25.0}, "vehicles of the test, 25 ms late themselves"),
