@@ -1,5 +1,6 @@
 """Mutual TLS between the real services: who is let in as whom, and what the others are told."""
 
+import asyncio
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,12 +15,14 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from cav_agent.config import AgentLimits
 from live_server import Files, certificates, channel_to, watch_call
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
-from rfcore.wire.address import own_problem
+from rfcore.wire.address import check_handshake, own_problem
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin_client import TwinClient
 from rfedge.certs import Members, certify, write_certificates
 from rfedge.cli.services import CertsAdd, CertsInit
+from rfedge.link import LinkSettings
+from rfedge.link.proxy import LinkProxy
 
 SOON = AgentLimits(give_up_s=5.0)
 
@@ -224,6 +227,21 @@ def test_a_watcher_in_plaintext_is_told_what_is_missing(
             list(TwinClient(f"127.0.0.1:{port}").watch())
     finally:
         server.stop(None).wait()
+
+
+@pytest.mark.parametrize("secured", [False, True])
+async def test_a_link_whose_server_is_not_up_is_not_called_a_matter_of_tls(
+    certs: Files, secured: bool
+) -> None:
+    tls = certs("vehicle-cav-1") if secured else None
+    proxy = LinkProxy(LinkSettings("127.0.0.1:1"))
+    address = await proxy.start()
+    try:
+        problem = await asyncio.to_thread(check_handshake, address, tls)
+    finally:
+        await proxy.stop()
+    assert problem.startswith(f"something listens at {address} and closes every connection")
+    assert "is the server behind it up?" in problem
 
 
 def test_files_that_do_not_belong_together_are_refused_by_option(certs: Files) -> None:
