@@ -31,10 +31,10 @@ from cav_agent.frames import (
     RetryReason,
     StreamEnd,
 )
-from cav_agent.server_connection import ServerConnection, retry_after_s
+from cav_agent.server_connection import ServerConnection
 from cav_agent.session import AgentSession, LinkState
 from rfcore.errors import ProtocolError, RfedgeError
-from rfcore.wire.conventions import AGENT_PROCESS, STREAM_METHOD, TILE, VEHICLE
+from rfcore.wire.conventions import AGENT_PROCESS, STREAM_METHOD, TILE, VEHICLE, retry_after_s
 from rfcore.wire.convert_answers import AnswerReader
 from rfcore.wire.messages import FieldNotice, PoseAhead, Welcome
 from rfcore.wire.notices import StreetNotice

@@ -28,12 +28,12 @@ from typing import TYPE_CHECKING, BinaryIO
 import grpc
 import structlog
 
-from cav_agent.server_connection import retry_after_s
 from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
 from rfcore.field import FieldStore
 from rfcore.field.archive import PREFIX_BYTES, array_ends, header_end
 from rfcore.field.splat_archive import detail_ends
 from rfcore.files import open_alone
+from rfcore.wire.conventions import retry_after_s
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 

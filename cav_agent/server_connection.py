@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable
 from types import TracebackType
 from typing import Self
 
@@ -18,7 +17,7 @@ import structlog
 from cav_agent.config import AgentConfig
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.address import ASK_AFTER_S, Address, check_handshake
-from rfcore.wire.conventions import CHANNEL_OPTIONS, RECONNECT_S, RETRY_AFTER, VEHICLE
+from rfcore.wire.conventions import CHANNEL_OPTIONS, RECONNECT_S, VEHICLE
 from rfcore.wire.tiles import MAX_TILES, Tile, tile_of
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2 as pb
@@ -32,9 +31,6 @@ REFUSED = (grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED)
 
 LIST_S = 10.0
 """Longest time for a connected server to list its tiles."""
-
-LONGEST_RETRY_AFTER_S = 30.0
-"""A server that is full says when to try again; the vehicle waits no longer than this."""
 
 WHOLE_STREET = "street"
 """Name of the only tile of a server that publishes none."""
@@ -187,11 +183,3 @@ def _tiles_of(listed: pb.ListFieldsResponse) -> tuple[Tile, ...]:
         here = ", ".join(listed.field_ids) or "none"
         raise UnknownField(f"the server holds several fields or none ({here}); choose with --field")
     return (Tile(WHOLE_STREET, check_field_id("field", listed.field_ids[0])),)
-
-
-def retry_after_s(trailing_metadata: Iterable[tuple[str, str | bytes]] | None) -> float:
-    """Return the pause that a server asked for when it refused a call; 0: it did not say."""
-    for key, value in trailing_metadata or ():
-        if key == RETRY_AFTER and isinstance(value, str) and value.isdecimal():
-            return min(int(value) / 1e3, LONGEST_RETRY_AFTER_S)
-    return 0.0

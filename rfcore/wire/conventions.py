@@ -5,6 +5,7 @@ Every option that departs from gRPC's default says why; the figures were measure
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 MAX_MESSAGE_BYTES: Final = 1 << 20
@@ -12,6 +13,9 @@ MAX_MESSAGE_BYTES: Final = 1 << 20
 
 RETRY_AFTER: Final = "retry-after-ms"
 """Trailing metadata of a refused stream: after how many milliseconds it may be opened again."""
+
+LONGEST_RETRY_AFTER_S: Final = 30.0
+"""A server that is full says when to try again; its peers wait no longer than this."""
 
 AGENT_PROCESS: Final = "agent-process"
 """Metadata of a stream: a name of the agent process that opened it, different for each process. A
@@ -105,3 +109,11 @@ SERVER_OPTIONS: Final[Options] = (
     # others: few calls shall fit whose headers are 13 kB and become 17 MB (an HPACK bomb).
     ("grpc.experimental.tcp_max_read_chunk_size", 16_384),
 )
+
+
+def retry_after_s(trailing_metadata: Iterable[tuple[str, str | bytes]] | None) -> float:
+    """Return the pause that a server asked for when it refused a call; 0: it did not say."""
+    for key, value in trailing_metadata or ():
+        if key == RETRY_AFTER and isinstance(value, str) and value.isdecimal():
+            return min(int(value) / 1e3, LONGEST_RETRY_AFTER_S)
+    return 0.0

@@ -20,12 +20,11 @@ import structlog
 from numpy.typing import NDArray
 
 from cav_agent.field_fetch import fetch_field
-from cav_agent.server_connection import retry_after_s
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
 from rfcore.field import FieldStore
 from rfcore.perception.objects import CameraKey
 from rfcore.wire.address import ASK_AFTER_S
-from rfcore.wire.conventions import RECONNECT_S
+from rfcore.wire.conventions import RECONNECT_S, retry_after_s
 from rfcore.wire.tiles import LearntLight, Tile, TileLight, learnt_of, tile_of
 from rfcore.wire.twin import Departure, TwinPicture
 from rfcore.wire.twin_client import AsyncTwinClient

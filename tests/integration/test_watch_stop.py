@@ -1,5 +1,6 @@
 """``rfedge watch`` ends when it is told to, at whatever moment that is."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -110,13 +111,25 @@ def test_a_watcher_ends_after_any_number_of_messages(
     assert not thread.is_alive()
 
 
-@pytest.mark.parametrize("switches", [0, 1, 2, 4, 8, 16, 32, 64, 128, 256])
-def test_a_watcher_ends_at_any_point_of_its_start(address: str, switches: int) -> None:
-    """Other threads run between the start and the stop: connecting, asking, the first messages."""
-    client = TwinClient(address)
-    thread = in_thread(lambda: module.watch(WatchSettings(), client))
-    for _ in range(64 * switches):
-        os.sched_yield()
+@pytest.mark.parametrize("calls", [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024])
+def test_a_watcher_ends_at_any_point_of_its_start(address: str, calls: int) -> None:
+    """Stopped once it has called so many functions: connecting, asking, the first messages."""
+    client, counted, reached = TwinClient(address), itertools.count(1), threading.Event()
+
+    def count(*_: Any) -> None:
+        if next(counted) == calls:
+            reached.set()
+
+    def run() -> None:
+        sys.settrace(count)
+        try:
+            module.watch(WatchSettings(), client)
+        finally:
+            sys.settrace(None)
+            reached.set()
+
+    thread = in_thread(run)
+    assert reached.wait(STARTED_S)
     client.stop()
     thread.join(STARTED_S)
     assert not thread.is_alive()
@@ -163,16 +176,15 @@ def test_a_signal_ends_the_watch_at_any_moment_with_a_whole_video(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Twenty times, each after more pictures than before."""
     twin.pictures = True
-    for repetition in range(20):
+    for pictures in (2, 3, 7, 40):
         lines: list[str] = []
         enough = threading.Event()
 
         def count(line: str, flush: bool, lines: Any = lines, enough: Any = enough) -> None:
             assert flush
             lines.append(line)
-            if len(lines) == 2 + 2 * repetition:  # noqa: B023 - called in this repetition only
+            if len(lines) == pictures:  # noqa: B023 - called in this repetition only
                 enough.set()
 
         def tell(enough: Any = enough) -> None:
@@ -181,7 +193,7 @@ def test_a_signal_ends_the_watch_at_any_moment_with_a_whole_video(
 
         monkeypatch.setattr(module, "print", count, raising=False)
         teller = in_thread(tell)
-        video = tmp_path / f"{repetition}.mp4"
+        video = tmp_path / f"{pictures}.mp4"
         watch_until_stopped(WatchSettings(video=video), TwinClient(address))
         teller.join()
         with av.open(str(video)) as container:
