@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfedge.evaluate.clips import STEADY, Clip, ClipCoder, CodedClip, psnr_of_mse
-from rfedge.evaluate.rate_curve import RateCurve, Window, rate_curve
+from rfedge.evaluate.rate_curve import MIN_POINTS, RateCurve, Window, rate_curve
 from rfedge.evaluate.runner import clip_key, coded_clip
 from rfedge.jobs import CellKey, CellStore, Rows
 
@@ -66,11 +66,12 @@ class Performance:
     clips: tuple[CodedClip, ...]
     cpu_ms_per_frame: float
     cpu: CpuTime | None = None
+    least_points: int = MIN_POINTS
 
     @property
     def steady(self) -> RateCurve:
         """The curve without the first frame."""
-        return rate_curve(self.clips, STEADY)
+        return rate_curve(self.clips, STEADY, self.least_points)
 
     @property
     def both_ends_ms(self) -> float:
@@ -208,33 +209,34 @@ def time_in_turns(
     window_db: Window,
     *,
     retime: bool = False,
+    rounds: int = ROUNDS,
 ) -> list[Performance]:
     """Return the performances with processor times for which all coders took turns.
 
-    In each of five rounds each coder codes and decodes the beginning of the clip once, near the
+    In each round each coder codes and decodes the beginning of the clip once, near the
     middle of the window: what else the machine does falls on all alike.
     """
     middle_db = sum(window_db) / 2
     tasks = {p.name: (coder, p.nearest(middle_db).point) for coder, p in coded}
     key: CellKey = {
-        "turns": ROUNDS,
+        "turns": rounds,
         "frames": clip.frames_digest,
         "hz": clip.rate_hz,
         "coders": "; ".join(f"{n} {c.version} at {p:g}" for n, (c, p) in tasks.items()),
     }
     if retime:
         store.cell(key).forget()
-    rows = store.rows(key, lambda: _rounds(clip, tasks))
+    rows = store.rows(key, lambda: _rounds(clip, tasks, rounds))
     times = {str(row.pop("name")): CpuTime(**row) for row in rows}
     return [
         replace(p, cpu=times[p.name], cpu_ms_per_frame=times[p.name].sender_ms) for _, p in coded
     ]
 
 
-def _rounds(clip: Clip, tasks: Mapping[str, tuple[ClipCoder, float]]) -> Rows:
+def _rounds(clip: Clip, tasks: Mapping[str, tuple[ClipCoder, float]], rounds: int) -> Rows:
     frames = clip.frames[clip.runs[0]][:TIMED_FRAMES]
     runs: dict[str, list[CodedClip]] = {name: [] for name in tasks}
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         for name, (coder, point) in tasks.items():
             runs[name].append(coder.code(frames, clip.rate_hz, point))
     return [{"name": name} | _cpu_time(those, len(frames)) for name, those in runs.items()]

@@ -24,6 +24,8 @@ with needs("eval"):
     from scipy.interpolate import PchipInterpolator
 
 MIN_POINTS = 6
+QUICK_POINTS = 4
+"""Fewest points of a curve: of a figure to report, and of a quick one."""
 PEAK = 255.0
 Window = tuple[float, float]
 """Lowest and highest quality, in decibels."""
@@ -38,10 +40,12 @@ class RateCurve:
 
     psnr_db: NDArray[np.float64]
     bytes_per_frame: NDArray[np.float64]
+    least_points: int = MIN_POINTS
 
     def __post_init__(self) -> None:
-        if len(self.psnr_db) < MIN_POINTS:
-            raise InvalidInput("curve", f"{len(self.psnr_db)} points, at least {MIN_POINTS} needed")
+        count, least = len(self.psnr_db), self.least_points
+        if count < least:
+            raise InvalidInput("curve", f"{count} points, at least {least} needed")
         if not np.isfinite(self.psnr_db).all() or (self.bytes_per_frame <= 0).any():
             raise InvalidInput("curve", "qualities must be finite and rates above 0")
         if (np.diff(self.psnr_db) <= 0).any():
@@ -78,7 +82,11 @@ class RateCurve:
         return PchipInterpolator(self.psnr_db, np.log(self.bytes_per_frame))
 
 
-def rate_curve(clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice) -> RateCurve:
+def rate_curve(
+    clips: Sequence[CodedClip],
+    frames: NDArray[np.intp] | slice,
+    least_points: int = MIN_POINTS,
+) -> RateCurve:
     """Return the curve of one clip coded at several points, over the chosen ``frames``.
 
     Points of one quality, as of a good field at rates where nothing is sent, count once, at the
@@ -87,7 +95,7 @@ def rate_curve(clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice) -> 
     mse = np.array([clip.luma_mse[frames].mean() for clip in clips])
     with np.errstate(divide="ignore"):
         psnr_db = 10 * np.log10(PEAK * PEAK / mse)
-    return _curve(psnr_db, clips, frames)
+    return _curve(psnr_db, clips, frames, least_points)
 
 
 def ssim_db(ssim: float) -> float:
@@ -102,12 +110,15 @@ def ssim_curve(clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice) -> 
 
 
 def _curve(
-    quality_db: NDArray[np.float64], clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice
+    quality_db: NDArray[np.float64],
+    clips: Sequence[CodedClip],
+    frames: NDArray[np.intp] | slice,
+    least_points: int = MIN_POINTS,
 ) -> RateCurve:
     rates = np.array([clip.frame_bytes[frames].mean() for clip in clips])
     order = np.lexsort((rates, quality_db))
     qualities, first = np.unique(quality_db[order], return_index=True)
-    return RateCurve(qualities, rates[order][first])
+    return RateCurve(qualities, rates[order][first], least_points)
 
 
 def bd_rate_percent(anchor: RateCurve, test: RateCurve, window_db: Window) -> float:

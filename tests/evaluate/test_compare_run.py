@@ -1,5 +1,6 @@
 """The verb ``rfedge eval compare``, from files to a result file."""
 
+import contextlib
 import io
 import json
 import math
@@ -17,7 +18,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfedge.evaluate import runner
 from rfedge.evaluate.clips import DriveName, read_drive
-from rfedge.evaluate.compare import EvalCompare, measure
+from rfedge.evaluate.compare import EvalCompare, measure, run
 from rfedge.evaluate.compare.drives import foreign_coder, jobs_of_drives, read_drive_comparisons
 from rfedge.evaluate.compare.measure import BEST, BEST_OF_ANY_CPU
 from rfedge.evaluate.compare.rows import compare_parts
@@ -139,8 +140,27 @@ def few_draws():
 def compared(thumbnail, tmp_path_factory):
     """A comparison over a window that our own points do not reach down to, with a background."""
     folder = tmp_path_factory.mktemp("compared")
-    job = job_of(thumbnail, folder, window=(33.0, 36.0), background=(thumbnail.empty,))
+    job = job_of(
+        thumbnail,
+        folder,
+        quick=False,
+        rivals=("x264-lowdelay",),
+        window=(33.0, 36.0),
+        background=(thumbnail.empty,),
+    )
     return job, run_compare(job, Console(quiet=True))
+
+
+@pytest.fixture(scope="module")
+def compared_quickly(thumbnail, tmp_path_factory):
+    """A quick comparison, what it printed, and its progress."""
+    job = job_of(thumbnail, tmp_path_factory.mktemp("quick"), window=(33.0, 36.0))
+    console = Console(record=True, file=io.StringIO(), width=80)
+    with pytest.MonkeyPatch.context() as patched, contextlib.redirect_stderr(io.StringIO()) as told:
+        patched.setattr(run, "TOLD_EVERY_S", 0.0)
+        patched.setattr(run, "TOLD_SHARE", 0.0)
+        result = run_compare(job, console)
+    return job, result, console.export_text(), told.getvalue()
 
 
 def test_every_curve_spans_the_window_that_was_asked_for(compared):
@@ -152,24 +172,19 @@ def test_every_curve_spans_the_window_that_was_asked_for(compared):
     assert {tuple(row["window_db"]) for row in result["rows"]} == {(33.0, 36.0)}
 
 
-def test_a_quick_comparison_has_no_interval_and_names_each_method_once(compared):
-    _, result = compared
+def test_a_quick_comparison_has_no_interval_and_names_each_method_once(compared_quickly):
+    _, result, _, _ = compared_quickly
     for row in result["rows"]:
         assert set(row) >= ROW_KEYS
         assert row["ci95"] is None
     assert {row["method"].rsplit("-", 1)[0] for row in result["rows"]} == {
         "rfedge-fast",
-        "rfedge-thorough",
-        "rfedge-render-only-fast",
         "rfedge-without-field-fast",
     }
 
 
-def test_a_quick_comparison_says_so_in_each_table_and_has_a_line_for_a_rival(compared):
-    job, result = compared
-    console = Console(record=True, file=io.StringIO(), width=80)
-    run_compare(job, console)
-    printed = console.export_text()
+def test_a_quick_comparison_says_so_in_each_table_and_has_a_line_for_a_rival(compared_quickly):
+    _, result, printed, _ = compared_quickly
     tables = list(compare_parts(result))
     assert printed.count("QUICK") == sum(isinstance(part, Table) for part in tables)
     for setting in {row["rival_setting"] for row in result["rows"]}:
@@ -177,11 +192,39 @@ def test_a_quick_comparison_says_so_in_each_table_and_has_a_line_for_a_rival(com
         assert len(lines) == 1
 
 
+def test_a_quick_comparison_says_how_many_clips_it_codes_and_how_many_are_done(compared_quickly):
+    _, _, printed, told = compared_quickly
+    count = int(re.search(r"(\d+) clips to code", printed)[1])
+    assert count <= 16
+    assert re.findall(r"(\d+) of (\d+) clips, about \d+ s left", told) == [
+        (str(done), str(count)) for done in range(1, count + 1)
+    ]
+
+
+def test_a_quick_comparison_is_near_a_whole_one(compared_quickly, tmp_path):
+    quick, result, _, _ = compared_quickly
+    anchor = "x264-our-tools-ultrafast"
+    whole = replace(quick, quick=False, rivals=(anchor,), out=tmp_path / "whole.json")
+    found = [
+        {
+            row["method"]: row["bd_rate_percent"]
+            for row in rows["rows"]
+            if row["rival"] == anchor and tuple(row["window_db"]) == (33.0, 36.0)
+        }
+        for rows in (result, run_compare(whole, Console(quiet=True)))
+    ]
+    for method, percent in found[0].items():
+        assert percent == pytest.approx(found[1][method], abs=3)
+
+
+def test_a_background_is_refused_for_a_quick_comparison(thumbnail, tmp_path):
+    with pytest.raises(InvalidInput, match="background"):
+        job_of(thumbnail, tmp_path, background=(thumbnail.empty,))
+
+
 def test_a_whole_comparison_has_its_interval_around_its_figure(compared):
-    """From the cells of a quick one: the drive is no longer than its runs."""
-    quick, _ = compared
-    job = replace(quick, quick=False, rivals=("x264-lowdelay",), out=quick.out.with_name("w.json"))
-    for row in run_compare(job, Console(quiet=True))["rows"]:
+    _, result = compared
+    for row in result["rows"]:
         low, high = row["ci95"]
         assert low <= row["bd_rate_percent"] <= high
 
@@ -216,11 +259,12 @@ def test_jobs_leave_all_cells_that_a_comparison_looks_for(
         return done
 
     monkeypatch.setattr(runner, "run_jobs", on_workers)
-    same = {"window": here.window, "background": here.background}
+    same = {"window": here.window, "background": here.background, "rivals": here.rivals}
+    same["quick"] = False
     job = job_of(thumbnail, tmp_path, ray="10.0.0.1:6379", **same)
     again = run_compare(job, Console(quiet=True))
     assert addresses == ["10.0.0.1:6379"]
-    assert len(cells) >= 75
+    assert len(cells) >= 50
     after = {path.name: path.read_bytes() for path in job.cells.iterdir()}
     assert {name: after[name] for name in cells} == cells
     assert len(after) == len(cells) + 2, "processor times, and whose bits they are"
@@ -275,7 +319,9 @@ def test_a_window_that_the_field_beats_is_refused_and_the_one_named_works(thumbn
 def test_a_background_without_its_drive_is_refused(thumbnail, tmp_path):
     elsewhere = thumbnail.empty.replace("wall@10", "alley@10")
     with pytest.raises(InvalidInput, match="alley"):
-        run_compare(job_of(thumbnail, tmp_path, background=(elsewhere,)), Console(quiet=True))
+        run_compare(
+            job_of(thumbnail, tmp_path, quick=False, background=(elsewhere,)), Console(quiet=True)
+        )
 
 
 def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path):

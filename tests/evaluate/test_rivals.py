@@ -156,7 +156,7 @@ PINNED = {
 }
 BY_NAME = {
     rival.name: rival
-    for families in (rival_families("veryfast", quick=False), ssim_rivals(quick=False))
+    for families in (rival_families("veryfast"), ssim_rivals())
     for family in families.values()
     for rival in family
 }

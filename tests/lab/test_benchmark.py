@@ -87,7 +87,7 @@ def test_v1_compares_as_the_comparison_does():
 
 
 def test_the_anchors_of_v1_run_as_the_rivals_of_the_comparison():
-    families = rival_families("veryfast", quick=False)
+    families = rival_families("veryfast")
     rivals = {rival.name: rival for family in families.values() for rival in family}
     for anchor in read_benchmark().anchors:
         rival: Any = rivals[anchor.name]

@@ -43,8 +43,8 @@ class EvalCompare(Experiment):
     method: tuple[str, ...] = ()
     """More codecs to compare with, as package.module:Class (see docs/explanation/evaluation.md)."""
     rivals: tuple[str, ...] = ()
-    """Compare with these rivals only, such as x264-our-tools-medium, and by PSNR only.
-    x264-lowdelay-psnr is added: the cost of sending the field is counted against it."""
+    """Compare with these rivals only, such as x264-our-tools-medium, and by PSNR only. Another
+    name lists them. x264-lowdelay-psnr is added: a field's own bytes are counted against it."""
     window: tuple[float, float] | None = None
     """Lowest and highest luma PSNR to compare over, in dB; 32 35 (and 30 35 where all reach it) if
     not given. Curves are coded at more points until they span it."""
@@ -68,6 +68,8 @@ class EvalCompare(Experiment):
         check_effort("effort", self.effort)
         if not (self.drives or self.decimated):
             raise InvalidInput("drives", "there is none")
+        if self.quick and self.background:
+            raise InvalidInput("background", "is for the split of the bits; run without --quick")
         if self.window is not None:
             low_db, high_db = self.window
             if not 0 < low_db < high_db < math.inf:

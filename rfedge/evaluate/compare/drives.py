@@ -33,7 +33,8 @@ from rfedge.evaluate.clips import (
 )
 from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.compare.foreground import ForegroundCoder, foreground_mask
-from rfedge.evaluate.field_coder import WITHOUT_FIELD, FieldCoder, RenderedClip, render_clip
+from rfedge.evaluate.field_coder import CRFS, WITHOUT_FIELD, FieldCoder, RenderedClip, render_clip
+from rfedge.evaluate.rate_curve import QUICK_POINTS
 from rfedge.evaluate.rivals import (
     Rival,
     svtav1_lowdelay,
@@ -53,7 +54,7 @@ KEYINTS = (10, 30, 250)
 OUR_TOOLS_PRESETS = ("veryfast", "medium", "veryslow")
 
 
-def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
+def rival_families(preset: str) -> dict[str, list[ClipCoder]]:
     """Return the rivals by codec: the anchors alone of their kind, the others at several settings.
 
     The first anchor is x264 as it comes, which is what a user has. It spends bits on looks that a
@@ -65,14 +66,9 @@ def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
         "x264-lowdelay": [x264_lowdelay(preset)],
         PAID_AGAINST: [x264_for_psnr(preset)],
     }
-    if quick:
-        tools: dict[str, list[ClipCoder]] = {
-            f"x264-our-tools-{preset}": [x264_with_our_tools(preset)]
-        }
-        return {**anchors, **tools, "svtav1-lowdelay": [svtav1_lowdelay(8)]}
     return {
         **anchors,
-        **{f"x264-our-tools-{p}": [x264_with_our_tools(p)] for p in OUR_TOOLS_PRESETS},
+        **{f"x264-our-tools-{p}": [x264_with_our_tools(p)] for p in (*OUR_TOOLS_PRESETS, preset)},
         "x265-medium": [x265_for_psnr("medium")],
         "svtav1-p6": [svtav1_lowdelay(6)],
         "x264-stronger": [x264_for_psnr(p) for p in ("medium", "veryslow")],
@@ -86,10 +82,8 @@ def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
     }
 
 
-def ssim_rivals(*, quick: bool) -> dict[str, list[ClipCoder]]:
+def ssim_rivals() -> dict[str, list[ClipCoder]]:
     """Return the rivals of a comparison by SSIM, tuned for it; SVT-AV1 cannot be at low delay."""
-    if quick:
-        return {"x264-ssim": [x264_for_ssim("veryfast")]}
     return {
         "x264-ssim": [x264_for_ssim("veryfast")],
         "x264-ssim-medium": [x264_for_ssim("medium")],
@@ -134,6 +128,7 @@ METHODS = (
 )
 """Our coder as it is; with nearly as much time for a slice as x264 medium takes; and without a past
 and without a field, which tells what each is worth."""
+QUICK_METHODS = (METHODS[0], METHODS[-1])
 
 
 def asked_families(job: EvalCompare) -> dict[str, list[ClipCoder]]:
@@ -141,11 +136,12 @@ def asked_families(job: EvalCompare) -> dict[str, list[ClipCoder]]:
 
     Raises ``InvalidInput`` for a name that is no family of rivals.
     """
-    families = rival_families(job.preset, quick=job.quick)
+    families = rival_families(job.preset)
     for name in job.rivals:
         if name not in families:
             raise InvalidInput("rivals", f"{name!r} is none of {', '.join(families)}")
-    wanted = {PAID_AGAINST, *(job.rivals or families)}
+    unasked = [f"x264-our-tools-{job.preset}"] if job.quick else families
+    wanted = {PAID_AGAINST, *(job.rivals or unasked)}
     return {name: family for name, family in families.items() if name in wanted}
 
 
@@ -238,6 +234,8 @@ def _drive_comparison(
 ) -> DriveComparison:
     clip = drive.clip(field_psnr_db=mean_psnr_db(field, drive.pictures))
     families = asked_families(job)
+    if job.quick:
+        families = {name: [*map(_at_few_points, those)] for name, those in families.items()}
     families |= {coder.name: [coder] for coder in map(foreign_coder, job.method)}
     rendered = render_clip(field, drive.cameras)
     foregrounds = _foregrounds(drive, background)
@@ -246,7 +244,7 @@ def _drive_comparison(
     if behind is not None:
         stamp += f", before {behind[:16]}"
     coders = {}
-    for own, method in METHODS:
+    for own, method in QUICK_METHODS if job.quick else METHODS:
         effort = method.effort or job.effort
         name = f"{own}-{effort}-{rendered.field_id[:12]}"
         coders[name] = FieldCoder(
@@ -255,13 +253,14 @@ def _drive_comparison(
             stamp,
             effort=effort,
             references=method.references,
+            points=_few(CRFS) if job.quick else CRFS,
             foregrounds=() if behind is None else foregrounds,
         )
     rival = None
     if behind is not None:
         rival_stamp = f"{stamp}, field {rendered.field_id}"
         rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
-    by_ssim = {} if job.rivals else ssim_rivals(quick=job.quick)
+    by_ssim = {} if job.rivals or job.quick else ssim_rivals()
     field_bytes = field.size_bytes if isinstance(field, OwnField) else given.field.stat().st_size
     return DriveComparison(
         clip,
@@ -275,6 +274,16 @@ def _drive_comparison(
         by_ssim,
         rival,
     )
+
+
+def _few(points: Sequence[float]) -> tuple[float, ...]:
+    """Return every second of eight or more points: BD-rates recorded with all move by 1.1 points
+    at most."""
+    return tuple(points[1::2] if len(points) >= 2 * QUICK_POINTS else points)
+
+
+def _at_few_points(coder: ClipCoder) -> ClipCoder:
+    return replace(coder, points=_few(coder.points)) if isinstance(coder, Rival) else coder
 
 
 def _foregrounds(drive: Drive, background: Drive | None) -> list[NDArray[np.bool_]]:

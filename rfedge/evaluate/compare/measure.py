@@ -176,6 +176,8 @@ def ssim_rows(
     clip: Clip, method: Performance, families: Mapping[str, Sequence[Performance]]
 ) -> list[SsimRow]:
     """Return a row per family over a window of mean SSIM; none where a curve does not span it."""
+    if not families:
+        return []
     low, high = SSIM_WINDOW
     window = (ssim_db(low), ssim_db(high))
     ours = ssim_curve(method.clips, STEADY)

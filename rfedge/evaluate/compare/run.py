@@ -6,16 +6,21 @@ first, so that a window that cannot be spanned ends the run before its long part
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import chdir, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.clips import Clip, ClipCoder
+from rfcore.program import working
+from rfedge.arguments import time_text
+from rfedge.evaluate.clips import QUICK, Clip, ClipCoder
 from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.compare.bits import SplitClip, split_rows
 from rfedge.evaluate.compare.drives import (
@@ -35,6 +40,7 @@ from rfedge.evaluate.compare.measure import (
 )
 from rfedge.evaluate.compare.rows import BitShareRow, compare_parts
 from rfedge.evaluate.performance import (
+    ROUNDS,
     Performance,
     WindowNotReached,
     perform,
@@ -42,8 +48,8 @@ from rfedge.evaluate.performance import (
     spanning_points,
     time_in_turns,
 )
-from rfedge.evaluate.rate_curve import Window
-from rfedge.evaluate.runner import Run, clip_key
+from rfedge.evaluate.rate_curve import QUICK_POINTS, Window
+from rfedge.evaluate.runner import Run, clip_key, coded_clip
 from rfedge.jobs import CellStore, Job, Tell
 from rfedge.results import rows_of
 
@@ -51,6 +57,10 @@ PARTS = 4
 """A drive's coders are split into so many jobs, each of which renders the drive anew in seconds."""
 WINDOWS_TRIED = 5
 """Windows that are looked for in place of one that a codec does not reach."""
+QUICK_ROUNDS = 1
+"""Rounds of processor times of a quick run."""
+TOLD_EVERY_S, TOLD_SHARE = 3.0, 0.05
+"""Progress is told after so many seconds, and after this share of the time so far."""
 
 
 def run_compare(job: EvalCompare, console: Console) -> dict[str, Any]:
@@ -67,7 +77,11 @@ def run_compare(job: EvalCompare, console: Console) -> dict[str, Any]:
     run = Run.begin("compare", job, fields, console)
     _announce(job, comparisons, run)
     run.parallel(_jobs(job), job.processes, job.ray)
-    _check_window(job, comparisons, run)
+    progress = _Progress(comparisons, run.store)
+    progress.code(ends=True)
+    with working("looking for points that span the window"):
+        _check_window(job, comparisons, run)
+    progress.code(ends=False)
     tables: dict[str, list[Any]] = {}
     for comparison in comparisons:
         for name, rows in _tables(job, comparison, run).items():
@@ -109,11 +123,48 @@ def _announce(job: EvalCompare, comparisons: Sequence[DriveComparison], run: Run
     clips = sum(len(coder.points) for c in comparisons for coder in c.coders)
     headline, *wider = map(_in_words, _windows_db(job))
     also = f" (and {', '.join(wider)} where it is spanned)" if wider else ""
+    part = ""
+    if job.quick:
+        most = QUICK.count * QUICK.frames
+        part = f" ({clips / len(comparisons):.0f} a drive, of at most {most} pictures)"
     run.tell(
-        f"BD-rates over {headline}{also}: {clips} clips to code, about {left_s / 60:.1f} minutes "
+        f"BD-rates over {headline}{also}: {clips} clips to code{part}, about {time_text(left_s)} "
         "of them left to do. Points are added where a curve does not span the window: the ends of "
         "all curves are coded first."
     )
+
+
+class _Progress:
+    """Codes the clips that are not there yet; says on stderr how many are, and the time left."""
+
+    def __init__(self, comparisons: Sequence[DriveComparison], store: CellStore) -> None:
+        self._store = store
+        self._waiting = [
+            (comparison.clip, coder, point)
+            for comparison in comparisons
+            for coder in comparison.coders
+            for point in coder.points
+            if not store.has(clip_key(comparison.clip, coder, point))
+        ]
+        self._total, self._done = len(self._waiting), 0
+        self._began_s = self._told_s = monotonic()
+
+    def code(self, *, ends: bool) -> None:
+        """Code the ends of all curves, or what is between."""
+        for clip, coder, point in self._waiting:
+            if (point in (coder.points[0], coder.points[-1])) is ends:
+                coded_clip(clip, coder, point, self._store)
+                self._done += 1
+                self._tell(f"{clip.scene} {clip.rate_hz:g} Hz, {coder.name}")
+
+    def _tell(self, last: str) -> None:
+        now_s = monotonic()
+        taken_s = now_s - self._began_s
+        if now_s - self._told_s >= max(TOLD_EVERY_S, TOLD_SHARE * taken_s):
+            left_s = taken_s / self._done * (self._total - self._done)
+            text = f"  {self._done} of {self._total} clips, about {time_text(left_s)} left: {last}"
+            print(text, file=sys.stderr, flush=True)
+            self._told_s = now_s
 
 
 def _check_window(job: EvalCompare, comparisons: Sequence[DriveComparison], run: Run) -> None:
@@ -166,11 +217,13 @@ def _tables(job: EvalCompare, comparison: DriveComparison, run: Run) -> dict[str
     clip, window = comparison.clip, _windows_db(job)[0]
 
     def performed(coder: ClipCoder, window: Window | None) -> Performance:
-        run.tell(f"  {clip.scene} {clip.rate_hz:g} Hz: {coder.name}")
-        return perform(clip, coder, run.store, window_db=window, timed=False)
+        coded = perform(clip, coder, run.store, window_db=window, timed=False)
+        return replace(coded, least_points=QUICK_POINTS) if job.quick else coded
 
     coded = [(coder, performed(coder, window)) for coder in comparison.compared]
-    timed = time_in_turns(clip, coded, run.store, window, retime=job.retime)
+    with working(f"{clip.scene} {clip.rate_hz:g} Hz: taking processor times"):
+        rounds = QUICK_ROUNDS if job.quick else ROUNDS
+        timed = time_in_turns(clip, coded, run.store, window, retime=job.retime, rounds=rounds)
     by_name = {each.name: each for each in timed}
     families = {n: [by_name[c.name] for c in f] for n, f in comparison.families.items()}
     methods = [by_name[coder.name] for coder in comparison.methods]
@@ -196,7 +249,7 @@ def _tables(job: EvalCompare, comparison: DriveComparison, run: Run) -> dict[str
         ],
         "ssim": ssim_rows(clip, methods[0], for_ssim),
         "break_even": [break_even_row(clip, m, anchor, field_bytes) for m in methods],
-        "bits": _bits(job, comparison, methods[0], run),
+        "bits": [] if job.quick else _bits(job, comparison, methods[0], run),
         "foreground": foreground,
         "curves": curve_rows(clip, methods, families),
     }
@@ -218,7 +271,8 @@ def _bits(
         "background": comparison.background,
     }
     same = {"scene": clip.scene, "hz": clip.rate_hz, "method": ours.name, "crf": crf}
-    rows = run.store.rows(key, lambda: split_rows(split))
+    with working(f"{clip.scene} {clip.rate_hz:g} Hz: splitting the bits by what pixels show"):
+        rows = run.store.rows(key, lambda: split_rows(split))
     return rows_of(BitShareRow, [same | row for row in rows])
 
 
