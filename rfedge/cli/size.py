@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from rfedge.sizing.tables import SizingTables
 
 
+COLUMNS = 88
+"""Letters of a line below the plot: as wide as the bars and the legend."""
+
+
 @dataclass(frozen=True)
 class Size:
     """Estimate the uplink and the cores that cameras need with us, x264, x265 and SVT-AV1.
@@ -135,7 +139,8 @@ def print_sizing(console: Console, sizing: Sizing) -> None:
     if demand.delay_ms is not None:
         console.print(
             f"link: Mbit/s with which {100 * demand.share:g} % of the frames are reconstructed "
-            f"within {demand.delay_ms:g} ms."
+            f"within {demand.delay_ms:g} ms, and of which the mean rate uses "
+            f"{100 * assumed.utilisation:g} % at most."
         )
     console.print(f"Measured on {sizing.measured_on}; steady state, without first frames.")
     console.print(f"Measured: {sizing.measured_at}; logarithms are interpolated between them.")
@@ -186,7 +191,7 @@ def _fleet_table(sizing: Sizing) -> RichTable:
 
 def write_sizing_plot(sizing: Sizing, path: Path) -> None:
     """Draw the mean rate with its interval, and the link that keeps the delay, of all vehicles with
-    each codec; the title has the conditions."""
+    each codec; the title and the lines below the picture have the conditions."""
     import matplotlib as mpl
     from matplotlib import pyplot as plt
 
@@ -195,9 +200,11 @@ def write_sizing_plot(sizing: Sizing, path: Path) -> None:
 
     demand, fleet = sizing.demand, sizing.fleet
     vehicles = "1 vehicle" if demand.vehicles == 1 else f"{demand.vehicles} vehicles"
-    conditions = [_cameras(demand), f"measured on {sizing.measured_on}", *sizing.warnings]
+    conditions = [f"Measured on {sizing.measured_on}.", *sizing.warnings]
     if demand.delay_ms is not None:
-        conditions[0] += f"; link: {100 * demand.share:g} % within {demand.delay_ms:g} ms"
+        used = f"the mean rate uses {100 * sizing.assumptions.utilisation:g} % of it at most"
+        in_time = f"{100 * demand.share:g} % of the frames within {demand.delay_ms:g} ms"
+        conditions.insert(0, f"Link: {in_time}; {used}.")
     with mpl.rc_context({**STYLE, "axes.grid.axis": "x"}):
         figure, axes = plt.subplots(figsize=(7.2, 0.6 * len(fleet) + 1.2))
         places = range(len(fleet))
@@ -221,15 +228,19 @@ def write_sizing_plot(sizing: Sizing, path: Path) -> None:
         axes.invert_yaxis()
         axes.set_xlabel("uplink, Mbit/s with transport")
         axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1), fontsize=9)
-        axes.set_title(
-            "\n".join([f"Uplink of {vehicles}", *map(_wrapped, conditions)]), loc="left", fontsize=9
+        axes.set_title(f"Uplink of {vehicles}\n{_cameras(demand)}", loc="left", fontsize=9)
+        axes.annotate(
+            "\n".join(textwrap.fill(text, COLUMNS) for text in conditions),
+            (0, 0),
+            (0, -38),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            va="top",
+            fontsize=8,
+            color=INK,
         )
         buffer = io.BytesIO()
         figure.savefig(buffer, format=path.suffix[1:], bbox_inches="tight", dpi=200)
         plt.close(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, buffer.getvalue())
-
-
-def _wrapped(text: str) -> str:
-    return "\n".join(textwrap.wrap(text, 100))

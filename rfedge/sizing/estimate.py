@@ -11,7 +11,7 @@ frames are repeated.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle, islice
 from typing import Annotated
@@ -24,8 +24,6 @@ from rfedge.sizing.tables import CameraDemand, SizingCell, SizingTables, check_r
 INSTANTS = 400
 """Length of the simulation, in pictures of a camera."""
 PRECISION = 1.005
-FULL = 0.99
-"""Mean rate over a link's from which a link counts as fully used."""
 MOST_BPS = 1e12
 HEXAGON = math.sqrt(3) / 2
 """Area of a site's hexagon over the square of the distance between sites."""
@@ -88,7 +86,8 @@ class Assumptions:
     """Average uplink spectral efficiency of a cell, bit/s/Hz; ITU-R M.2410 requires 5.4 in dense
     urban and 1.6 in rural areas."""
     utilisation: float = 0.7
-    """Share of a cell's capacity to plan with."""
+    """Share of a cell's capacity to plan with, and of a vehicle's link that the mean rate may use:
+    frames of other streets vary more than those of the short clips that were measured."""
     inter_site_m: float = 200.0
     """Distance between sites, m; ITU-R M.2412 has 200 for dense urban and 1732 for rural areas."""
     sectors: int = 3
@@ -120,9 +119,11 @@ class Assumptions:
 class Estimate:
     """One codec's needs for a vehicle: Mbit/s with transport, and cores at either end.
 
-    ``mbps`` is the mean rate, with the 95 % interval of the nearest cell; ``link_mbps`` the link
-    that keeps the delay, None unless one is asked for and can be kept. A cell holds as many
-    vehicles as its uplink carries of that link, or of the mean rate.
+    ``mbps`` is the mean rate, with the 95 % interval of the nearest cell. ``least_link_mbps``: the
+    link that keeps the delay for the frames that were measured; ``link_mbps``: the link to plan
+    with, which the mean rate also uses to ``Assumptions.utilisation`` at most. Both are None unless
+    a delay is asked for and can be kept. A cell, whose capacity has that margin already, holds as
+    many vehicles as its uplink carries of the least link, or of the mean rate.
     """
 
     codec: str
@@ -134,6 +135,7 @@ class Estimate:
     vehicles_per_cell: int
     vehicles_per_km2: float
     link_mbps: float | None = None
+    least_link_mbps: float | None = None
 
 
 @dataclass(frozen=True)
@@ -200,9 +202,9 @@ def estimate(
         assumptions,
         tables.measured_on,
         made,
-        [*_notes(reach), *_late(demand, left_ms)],
+        [*_notes(reach), *_late(demand, left_ms), *_roomy_links(made, assumptions)],
         tables.measured_at,
-        [] if demand.delay_ms is None else [*_reversals(demand, made), *_full_links(made)],
+        [] if demand.delay_ms is None else _reversals(demand, made),
         [FleetEstimate.of(one, demand.vehicles) for one in made],
     )
 
@@ -228,16 +230,19 @@ def _reversals(demand: Demand, made: Sequence[Estimate]) -> list[str]:
     ]
 
 
-def _full_links(made: Sequence[Estimate]) -> list[str]:
-    """Return a warning that names the codecs whose link is no faster than their mean rate."""
-    full = [one.codec for one in made if one.link_mbps and one.mbps >= FULL * one.link_mbps]
-    if not full:
-        return []
-    return [
-        f"the link of {', '.join(full)} equals the mean rate, so it is used to 100 %. Frames of "
-        "other streets vary more than those of the short clips that were measured: plan with a "
-        "faster link"
+def _roomy_links(made: Sequence[Estimate], assumptions: Assumptions) -> Iterator[str]:
+    """Yield a note that names the codecs whose link is faster than the delay alone needs."""
+    roomy = [
+        f"{one.codec} {one.least_link_mbps:.3g}"
+        for one in made
+        if one.link_mbps and one.least_link_mbps and one.link_mbps > one.least_link_mbps
     ]
+    if roomy:
+        yield (
+            f"a slower link keeps the delay for the short clips that were measured: "
+            f"{', '.join(roomy)} Mbit/s. Other streets vary more: as planned, the mean rate uses "
+            f"{100 * assumptions.utilisation:g} % of the link (--utilisation)"
+        )
 
 
 def _left_ms(demand: Demand, cells: Sequence[SizingCell], assumptions: Assumptions) -> float | None:
@@ -298,13 +303,14 @@ def _estimate(
     pictures_per_s = demand.cameras * demand.hz
     mbps_of = 8e-6 * pictures_per_s * (1 + assumptions.overhead_percent / 100)
     sender_ms, receiver_ms = _times_ms(wanted, cells)
-    mbps, link_mbps = mbps_of * frame_bytes, None
+    mbps, link_mbps, least_mbps = mbps_of * frame_bytes, None, None
     if left_ms is not None and left_ms > 0:
         sizes = [frame_bytes * ratio for ratio in nearest.frame_ratios]
         frames_bps = needed_bps(sizes, demand.cameras, demand.hz, left_ms / 1e3, demand.share)
-        link_mbps = frames_bps / 1e6 * (1 + assumptions.overhead_percent / 100)
+        least_mbps = frames_bps / 1e6 * (1 + assumptions.overhead_percent / 100)
+        link_mbps = max(least_mbps, mbps / assumptions.utilisation)
     is_late = left_ms is not None and left_ms <= 0
-    vehicles = 0 if is_late else math.floor(assumptions.cell_mbps / (link_mbps or mbps))
+    vehicles = 0 if is_late else math.floor(assumptions.cell_mbps / (least_mbps or mbps))
     return Estimate(
         codec=cells[0].codec,
         mbps=mbps,
@@ -315,6 +321,7 @@ def _estimate(
         vehicles_per_cell=vehicles,
         vehicles_per_km2=vehicles * assumptions.cells_per_km2,
         link_mbps=link_mbps,
+        least_link_mbps=least_mbps,
     )
 
 

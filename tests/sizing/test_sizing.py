@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from rfcore.errors import InvalidInput
 from rfcore.link.shaper import ConstantRate
 from rfedge.cli import parse
+from rfedge.cli.size import COLUMNS
 from rfedge.sizing.estimate import (
     INSTANTS,
     Assumptions,
@@ -253,12 +254,17 @@ def test_a_codec_that_is_late_on_any_link_has_lost_its_saving():
     assert any("no link will do" in warning for warning in sizing.warnings)
 
 
-@pytest.mark.parametrize(("delay_ms", "is_full"), [(1000.0, True), (60.0, False)])
-def test_a_link_that_equals_the_mean_rate_is_warned_of_and_no_other(delay_ms, is_full):
-    sizing = estimate(Demand(1, 640, 360, 10.0, 34.0, delay_ms=delay_ms), slower(1.0))
+@pytest.mark.parametrize(("delay_ms", "is_long"), [(1000.0, True), (60.0, False)])
+@pytest.mark.parametrize("share", [0.7, 0.9])
+def test_a_planned_link_is_used_to_a_share_and_carries_the_delay(delay_ms, is_long, share):
+    """Frames are all of one size: with much time, the least link is the mean rate."""
+    demand, assumed = Demand(1, 640, 360, 10.0, 34.0, delay_ms), Assumptions(utilisation=share)
+    sizing = estimate(demand, slower(1.0), assumed)
     for one in sizing.estimates:
-        assert (one.link_mbps == pytest.approx(one.mbps, rel=0.01)) == is_full
-    assert any("used to 100 %" in warning for warning in sizing.warnings) == is_full
+        assert (one.least_link_mbps == pytest.approx(one.mbps, rel=0.01)) == is_long
+        assert one.link_mbps == pytest.approx(max(one.least_link_mbps, one.mbps / share))
+        assert one.vehicles_per_cell == math.floor(assumed.cell_mbps / one.least_link_mbps)
+    assert any("a slower link keeps the delay" in note for note in sizing.beyond) == is_long
 
 
 @pytest.mark.parametrize(
@@ -271,7 +277,9 @@ def test_a_plot_for_a_report_names_its_conditions(tmp_path, suffix, magic, capsy
     assert plot.read_bytes().startswith(magic)
     if suffix == "svg":
         conditions = ("12 vehicles", "4 cameras of 640x360 px at 10 Hz", "150 ms", "Mbit/s")
-        assert all(name in plot.read_text() for name in (*CODECS, *conditions))
+        drawn = plot.read_text()
+        assert all(name in drawn for name in (*CODECS, *conditions))
+        assert max(map(len, re.findall(r"<!-- (.*?) -->", drawn))) <= COLUMNS
     assert "All 12 vehicles" in capsys.readouterr().out, "a file does not silence the table"
 
 
