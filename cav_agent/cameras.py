@@ -93,6 +93,11 @@ class RecordedCameras:
         return len(self._instants)
 
     @property
+    def pictures(self) -> list[PosedPicture]:
+        """The pictures of all cameras, in order of their instants."""
+        return [picture for instant in self._instants for picture in instant.pictures.values()]
+
+    @property
     def positions(self) -> tuple[Position, ...]:
         """Return where the vehicle was at each instant."""
         return tuple(instant.world_from_rig.translation_m[:2] for instant in self._instants)

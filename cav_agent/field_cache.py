@@ -18,7 +18,13 @@ from typing import Any
 
 import structlog
 
-from cav_agent.cameras import VehicleCamera, VehicleCameras, instant_numbers, recorded_cameras
+from cav_agent.cameras import (
+    RecordedCameras,
+    VehicleCamera,
+    VehicleCameras,
+    instant_numbers,
+    recorded_cameras,
+)
 from cav_agent.config import AgentConfig
 from cav_agent.deadline import DeadlineController, DeadlineRungs, FixedRung, Rungs
 from cav_agent.field_fetch import Beginnings, FetchPace, fetch_field
@@ -32,6 +38,7 @@ from rfcore.codec.sender.ladder import MeasuredRung, Rung, read_ladder
 from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
 from rfcore.field import FULL, FieldStore, RadianceField
 from rfcore.field.own import OwnField
+from rfcore.field.place import check_place
 from rfcore.field.store import decode_beginning
 from rfcore.wire.tiles import Tile
 
@@ -93,7 +100,7 @@ class FieldCache:
         self._observer = observer
         self._prepared: OrderedDict[Tile, asyncio.Task[PreparedField]] = OrderedDict()
         self._fetching: dict[Tile, asyncio.Task[None]] = {}
-        self._fetching_own: set[asyncio.Task[None]] = set()
+        self._background: set[asyncio.Task[None]] = set()
         self.pace = FetchPace(
             config.fetch_share, lambda: any(map(_succeeded, self._prepared.values()))
         )
@@ -115,7 +122,7 @@ class FieldCache:
     async def close(self) -> None:
         """Stop what is being fetched or prepared."""
         tasks: list[asyncio.Task[Any]] = [*self._prepared.values(), *self._fetching.values()]
-        tasks += self._fetching_own
+        tasks += self._background
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -126,6 +133,7 @@ class FieldCache:
         preview: tuple[str, ...] = ()
         if self._own or self._needs_all or await self._holds(tile.field_id):
             field = await self._opened(served, (tile.field_id,))
+            own.whole.set_result(field)
         elif tile.preview is not None:
             preview = tile.preview.field_ids
             field = await self._opened(served, preview)
@@ -141,7 +149,35 @@ class FieldCache:
         own.shown_by(lights)
         if preview:
             self._begin(self._arrive(served, own))
+        pictures = prepared.pictures
+        if isinstance(pictures, RecordedCameras) and not self._finds_poses:
+            self._begin(self._check_place(served, own, pictures))
         return prepared
+
+    async def _check_place(
+        self, served: ServedTile, own: ArrivingField, drive: RecordedCameras
+    ) -> None:
+        """Warn, once the tile's own field is there, if the pictures on its ground show another
+        place."""
+        field, config, tile = await own.whole, self._config, served.tile
+        name = self._own.name if self._own else str(config.fields / f"{tile.field_id}.rff")
+        origin = field.metadata.tile_origin
+        seen = [
+            picture
+            for picture in drive.pictures
+            if not tile.distance_m(
+                *origin.globalise(picture.camera.world_from_cam).translation_m[:2]
+            )
+        ]
+        problem: str | None = None
+        try:
+            names = (name, str(config.drive or config.rig))
+            if seen:
+                problem = await asyncio.to_thread(check_place, field, seen, names)
+        except RfedgeError as error:
+            problem = str(error)
+        if problem is not None:
+            log.warning("field of another place", tile=tile.name, problem=problem)
 
     async def _first(self, served: ServedTile, own: ArrivingField) -> RadianceField:
         """Begin to fetch the tile's own field; return what can be drawn of it first."""
@@ -158,9 +194,14 @@ class FieldCache:
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
-        self._fetching_own.add(task)
-        task.add_done_callback(self._fetching_own.discard)
+        self._background.add(task)
+        task.add_done_callback(self._background.discard)
         return task
+
+    @property
+    def _finds_poses(self) -> bool:
+        """Return whether poses are not those of the drive."""
+        return self._config.localise or self._config.feed.source is not None
 
     @property
     def _needs_all(self) -> bool:
@@ -169,7 +210,7 @@ class FieldCache:
         It does where a camera is searched in it on another thread (``--localise``), and where a
         feed's positions are checked against its bounds.
         """
-        return self._config.localise or self._config.feed.source is not None
+        return self._finds_poses
 
     async def _arrive(self, served: ServedTile, own: ArrivingField) -> None:
         """Fetch the tile's own field and have it drawn; try again until all of it is there.
@@ -199,7 +240,9 @@ class FieldCache:
             log.info("beginning of the field ready", detail=field.most_detail, bytes=len(data))
 
         beginnings = None if served.tile.preview else Beginnings(begin)
-        await take(await self._opened(served, (served.tile.field_id,), beginnings))
+        field = await self._opened(served, (served.tile.field_id,), beginnings)
+        await take(field)
+        own.whole.set_result(field)
 
     def _beginning(self, data: bytes, field_id: str) -> RadianceField:
         render = self._config.render
@@ -307,7 +350,9 @@ class ArrivingField:
     """The tile's own field as far as it has arrived, or its preview; used on the event loop."""
 
     def __init__(self) -> None:
-        self.first: asyncio.Future[RadianceField] = asyncio.get_running_loop().create_future()
+        loop = asyncio.get_running_loop()
+        self.first: asyncio.Future[RadianceField] = loop.create_future()
+        self.whole: asyncio.Future[RadianceField] = loop.create_future()
         self.field: RadianceField | None = None
         self._lights: TileLights | None = None
 

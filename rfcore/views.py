@@ -23,7 +23,7 @@ CPU at the first request, and until then refers to the device's memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -228,6 +228,13 @@ class PosedPicture:
     camera: Camera
     read: Callable[[], NDArray[np.uint8]]
     time_ns: int = 0
+
+
+def spread(pictures: Sequence[PosedPicture], most: int) -> list[PosedPicture]:
+    """Return at most ``most`` of the pictures, evenly over all of them."""
+    if len(pictures) <= most:
+        return list(pictures)
+    return [pictures[i] for i in np.linspace(0, len(pictures) - 1, most).round().astype(int)]
 
 
 @dataclass(frozen=True)

@@ -101,18 +101,26 @@ def open_field(name: Path | str, *, threads: int = 1, isa: str | None = None) ->
     return load_field(field_path(name), threads=threads, isa=isa, max_bytes=max_field_bytes())
 
 
-def open_drive(path: Path, field: RadianceField | None = None) -> Dataset:
+def open_drive(
+    path: Path, field: RadianceField | None = None, field_name: str | None = None
+) -> Dataset:
     """Read a dataset around a field's origin; say on stderr what was done to its pictures.
 
     Lenses are undistorted as ``rfedge train --undistort`` does, so a field trained so can be seen
-    from its own pictures.
+    from its own pictures. With ``field_name``, what the user called the field, a warning says where
+    it does not show what the pictures do; raises ``InvalidInput`` where it is far from them all.
     """
     from rfcore.dataset import Distortion, read_dataset
+    from rfcore.field.place import check_place
 
     origin = field.metadata.tile_origin if field is not None else None
     dataset = read_dataset(path, tile_origin=origin, distortion=Distortion.UNDISTORT)
     for change in dataset.changes:
         print(f"{path}: {change}", file=sys.stderr)
+    if field is not None and field_name is not None:
+        warning = check_place(field, dataset.pictures, (field_name, str(path)))
+        if warning:
+            print(f"warning: {warning}", file=sys.stderr)
     return dataset
 
 

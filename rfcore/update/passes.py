@@ -26,7 +26,7 @@ from rfcore.image import I420
 from rfcore.native.warp import BLOCK_PX, warp_i420
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.train.targets import Target
-from rfcore.views import FieldView, PosedPicture
+from rfcore.views import FieldView, PosedPicture, spread
 
 HOLD_BACK_EVERY = 4
 FEWEST_FRAMES = 8
@@ -78,13 +78,6 @@ def split_frames(passes: Sequence[Pass], most: int) -> tuple[list[SeenFrame], li
             is_held_back = place % HOLD_BACK_EVERY == HOLD_BACK_EVERY // 2
             (held_back if is_held_back else learnt).append(frame)
     return learnt, held_back
-
-
-def spread(pictures: Sequence[PosedPicture], most: int) -> list[PosedPicture]:
-    """Return at most ``most`` of the pictures, evenly over all of them."""
-    if len(pictures) <= most:
-        return list(pictures)
-    return [pictures[i] for i in np.linspace(0, len(pictures) - 1, most).round().astype(int)]
 
 
 FAR_LEVELS = 20

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -70,8 +69,7 @@ class Encode:
 
         isa = renderer_isa(self.renderer)
         field = open_field(self.field, threads=self.threads, isa=isa)
-        dataset = open_drive(self.drive, field)
-        self._check_place(field, dataset)
+        dataset = open_drive(self.drive, field, str(self.field))
         k = dataset.pictures[0].camera.intrinsics
         qp_map = MaskSettings(self.mask, self.mask_qp).qp_map((k.width_px, k.height_px))
         coding = self.coding
@@ -103,19 +101,6 @@ class Encode:
         print(f"  {rate}, luma PSNR {quality.psnr_db:.2f} dB")
         if self.against_x264:
             print(f"  {quality.against_x264(coded, self.crf, rate_hz or UNTIMED_HZ)}")
-
-    def _check_place(self, field: RadianceField, dataset: Dataset) -> None:
-        """Warn where the field shows something else than the drive's pictures."""
-        from rfedge.fields.check import FITS_DB, check_place
-
-        fit_db = check_place(field, dataset.pictures)
-        if fit_db < FITS_DB:
-            print(
-                f"warning: the field's renders have {fit_db:.1f} dB against the drive's pictures, "
-                f"a field of the place {FITS_DB:g} dB or more: is it of another place, frame or "
-                f"light? rfedge field check {self.field} --drive {self.drive}",
-                file=sys.stderr,
-            )
 
     def _located(self, field: RadianceField, dataset: Dataset) -> Locate | None:
         """Return the function that finds the poses, or None without --localise."""

@@ -72,7 +72,7 @@ class Localise:
 
         error = parse_start_error(self.start_error)
         field = open_field(self.field, threads=self.threads)
-        pictures = open_drive(self.drive, field).pictures
+        pictures = open_drive(self.drive, field, str(self.field)).pictures
         count = len(pictures) if self.tries is None else self.tries
         shown, feed = Console(stderr=True), None
         if self.pose_feed is None:

@@ -83,7 +83,8 @@ class Render:
         elif self.drive is None:
             raise InvalidInput("drive", "--path drive needs --drive, a dataset with the poses")
         else:
-            viewpoints = drive_viewpoints(open_drive(self.drive, field).pictures)
+            drive = open_drive(self.drive, field, str(self.field))
+            viewpoints = drive_viewpoints(drive.pictures)
         if self.psnr and viewpoints[0].seen is None:
             raise InvalidInput("psnr", "compares with a drive's pictures; give --drive DATASET")
         pictures = pictures_along(field, viewpoints, quality)

@@ -228,7 +228,8 @@ class DriveOfField:
 
     def read(self, limit: int | Runs | None) -> tuple[Drive, RadianceField]:
         """Read the frames and the field."""
-        return read_drive(self.name, limit), open_field(self.field)
+        field = open_field(self.field)
+        return read_drive(self.name, limit, (field, self.field)), field
 
 
 @dataclass(frozen=True)
@@ -320,12 +321,17 @@ def frames_digest(frames: Sequence[I420]) -> str:
     return total.hexdigest()
 
 
-def read_drive(name: DriveName | str, limit: int | Runs | None = None) -> Drive:
+def read_drive(
+    name: DriveName | str,
+    limit: int | Runs | None = None,
+    field: tuple[RadianceField, Path] | None = None,
+) -> Drive:
     """Read at most the first ``limit`` frames, or runs, of ``NAME@HZ=DATASET``; raises as
-    ``DriveName.parse`` does."""
+    ``DriveName.parse`` does, and as ``open_drive`` for a ``field`` of another place."""
     if isinstance(name, str):
         name = DriveName.parse(name)
-    pictures: Sequence[PosedPicture] = open_drive(name.dataset).pictures
+    known = () if field is None else (field[0], str(field[1]))
+    pictures: Sequence[PosedPicture] = open_drive(name.dataset, *known).pictures
     length = len(pictures)
     part = None
     if isinstance(limit, Runs):

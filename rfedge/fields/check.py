@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
+from rfcore.field.place import FITS_DB, PAIRS
 from rfcore.field.quality import LevelOfDetail
 from rfcore.field.similarity import Similarity, moved
 from rfcore.image import Rgb, rgb_from_colour
 from rfcore.metrics import psnr
-from rfcore.update.passes import spread
-from rfcore.views import PosedPicture
+from rfcore.views import PosedPicture, spread
 
 UNITS = {"": 1.0, "centimetres": 100.0, "millimetres": 1000.0, "hundreds of metres": 0.01}
 """Field units in a metre of the drive's world."""
@@ -113,13 +113,9 @@ def _axes() -> dict[str, Similarity]:
     return turns
 
 
-PAIRS = 4
 PROBES = 2
 PROBE_WIDTH_PX = 96
 FINALISTS = 8
-FITS_DB = 18.0
-"""A field of the place in the right frame is above this, even with vehicles it has never seen (21.3
-dB in the published figures); other places and frames gave 6 to 14 dB."""
 GAIN_DB = 3.0
 """Another convention must be so much better to be believed below ``FITS_DB``."""
 MODE_GAIN_DB = 0.5
@@ -128,34 +124,6 @@ the wrong mode lost 4.2 dB on the first sample; between modes that both fit ther
 MAX_PAIR_WIDTH_PX = 640
 
 F32 = NDArray[np.float32]
-
-
-FAR = 10.0
-"""Distance of a camera from a field's middle, over that of half of the splats, from which on it is
-taken for a camera of another place: those of the sample stay below 4."""
-
-
-def check_place(field: RadianceField, pictures: Sequence[PosedPicture]) -> float:
-    """Return the PSNR in dB of renders against pictures, the mean of four.
-
-    Raises ``InvalidInput`` when all cameras are far away from the field.
-    """
-    eyes = np.array([picture.camera.world_from_cam.translation_m for picture in pictures])
-    low, high = np.array(field.bounds.low_m), np.array(field.bounds.high_m)
-    middle, reach_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-    if isinstance(field, SplatField) and field.primitives:
-        means = field.gaussians.means.astype(np.float64)
-        middle = np.median(means, axis=0)
-        reach_m = float(np.median(np.linalg.norm(means - middle, axis=1)))
-    nearest_m = float(np.linalg.norm(eyes - middle, axis=1).min())
-    if reach_m > 0 and nearest_m > FAR * reach_m:  # an own renderer may state no bounds
-        raise InvalidInput(
-            "field",
-            f"is of another place than the drive: its nearest camera is {nearest_m:.4g} m from the "
-            f"field's middle, and half of the field lies within {reach_m:.4g} m; give the field of "
-            "this drive, or poses in its frame (rfedge field check)",
-        )
-    return _psnr_db(_FieldInDrive(field), spread(pictures, PAIRS), AS_GIVEN)
 
 
 @dataclass(frozen=True)

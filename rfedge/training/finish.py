@@ -32,9 +32,9 @@ from rfcore.field.store import encode_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.train.levels import LevelFitConfig, SecondsLeft, fitted, with_levels
 from rfcore.train.trainer import held_out_quality
-from rfcore.update.passes import SeenFrame, spread
+from rfcore.update.passes import SeenFrame
 from rfcore.update.run import Trial, saved_percent, try_field
-from rfcore.views import PosedPicture
+from rfcore.views import PosedPicture, spread
 
 MOST_CAMERAS = 60
 """Number of cameras, evenly spread, from which the visible directions of splats are taken."""

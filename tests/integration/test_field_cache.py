@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry
+from structlog.testing import capture_logs
 
 from cav_agent.cameras import instant_numbers, recorded_cameras
 from cav_agent.config import AgentConfig
@@ -73,6 +74,23 @@ async def test_tiles_of_one_field_share_what_is_prepared(street: Any, config: Ag
     assert west.field.field_id == street.field_id
     assert west.cameras[0].codec.size_px == (76, 52)
     assert len(west.pictures) == 6
+
+
+@pytest.mark.parametrize(("east_m", "is_warned_of"), [(0.0, False), (3.0, True), (500.0, True)])
+async def test_a_field_of_another_place_is_warned_of_once_it_is_there(
+    street: Any, config: AgentConfig, tmp_path: Path, east_m: float, is_warned_of: bool
+) -> None:
+    splats = street.field.gaussians
+    moved = SplatField(replace(splats, means=splats.means + np.float32([east_m, 0.0, 0.0])))
+    field_id = save_field(moved, tmp_path / "moved.rff")
+    cache = cache_of(replace(config, fields=tmp_path))
+    with capture_logs() as logs:
+        await cache.prepared(served(field_id))
+        while cache._background:
+            await asyncio.sleep(0.001)
+    problems = [line["problem"] for line in logs if line["event"] == "field of another place"]
+    assert len(problems) == is_warned_of
+    assert all(f"rfedge field check {tmp_path / field_id}.rff --drive" in p for p in problems)
 
 
 async def test_a_failure_is_not_kept(street: Any, config: AgentConfig, tmp_path: Path) -> None:

@@ -209,14 +209,15 @@ def read_drive_comparisons(job: EvalCompare) -> list[DriveComparison]:
     opened = cache(open_field)
     comparisons = []
     for given in slow:
-        drive = read_drive(given.name).every(DECIMATION)
+        field = opened(given.field)
+        drive = read_drive(given.name, field=(field, given.field)).every(DECIMATION)
         if job.quick:
             drive = drive.spread(QUICK)
-        comparisons.append(_drive_comparison(job, given, drive, None, opened(given.field)))
+        comparisons.append(_drive_comparison(job, given, drive, None, field))
     for given in drives:
-        drive, name = read_drive(given.name, limit), behind.get(_name(given.name))
+        field, name = opened(given.field), behind.get(_name(given.name))
+        drive = read_drive(given.name, limit, (field, given.field))
         background = None if name is None else read_drive(name, limit)
-        field = opened(given.field)
         comparisons.append(_drive_comparison(job, given, drive, background, field))
     return comparisons
 

@@ -105,7 +105,8 @@ def lossy_link_parts(result: Result) -> Iterator[Table | str]:
 def run_lossy_link(job: EvalLossyLink, console: Console) -> dict[str, Any]:
     """Drive over every link, write the result and print its rows."""
     run = Run.begin("lossy-link", job, [job.field], console)
-    drive, renderer = read_drive(job.drive), load_field(job.field)
+    renderer = load_field(job.field)
+    drive = read_drive(job.drive, None, (renderer, job.field))
     rendered = render_clip(renderer, drive.cameras)
     seconds = QUICK_S if job.quick else job.seconds
     rows: list[LossyLinkRow] = []

@@ -190,7 +190,7 @@ def run_never_worse(job: EvalNeverWorse, console: Console) -> dict[str, Any]:
     run, field = Run.begin("never-worse", job, [job.field], console), open_field(job.field)
     drives = [
         NeverWorse(drive, controls_of(field, drive), job.effort, job.preset, program_version())
-        for drive in _drives(job)
+        for drive in _drives(job, field)
     ]
     left_s = sum(seconds_left(each.clip, each.coders.values(), run.store) for each in drives)
     run.tell(f"{len(drives)} drives, about {left_s / 60:.1f} minutes left to do")
@@ -200,11 +200,12 @@ def run_never_worse(job: EvalNeverWorse, console: Console) -> dict[str, Any]:
     return run.finish(content, never_worse_parts)
 
 
-def _drives(job: EvalNeverWorse) -> list[Drive]:
-    slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
+def _drives(job: EvalNeverWorse, field: RadianceField) -> list[Drive]:
+    named, limit = (field, job.field), QUICK if job.quick else None
+    slow = [read_drive(text, None, named).every(DECIMATION) for text in job.decimated]
     if job.quick:
         slow = [drive.spread(QUICK) for drive in slow]
-    return [*slow, *(read_drive(text, QUICK if job.quick else None) for text in job.drives)]
+    return [*slow, *(read_drive(text, limit, named) for text in job.drives)]
 
 
 DRIVE = Column("drive", lambda row: f"{row.scene}, {row.hz:g} Hz")
