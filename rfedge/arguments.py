@@ -49,6 +49,9 @@ JSON = arg(metavar="FILE.json")
 Up = Literal["z", "y", "-y"]
 """An axis that points up (``rfedge.fields.viewpoints.UPS``)."""
 
+ASSUMED_HZ = 10.0
+"""Rate of a drive whose pictures have no times, where none is stated."""
+RATE = arg(metavar="HZ")
 IMPORTED = Path("out/fields")
 """Folder of the fields that ``rfedge field import`` writes."""
 SAMPLES = sample_path("fields")
@@ -122,6 +125,19 @@ def open_drive(
         if warning:
             print(f"warning: {warning}", file=sys.stderr)
     return dataset
+
+
+def drive_rate_hz(stated_hz: float | None, times_hz: float | None, drive: Path) -> float:
+    """Return the rate of a drive: the stated one, else that of its times; say if it is assumed.
+
+    Raises ``InvalidInput`` for a rate outside 0.01..1000 Hz.
+    """
+    if stated_hz is not None and not 0.01 <= stated_hz <= 1000:
+        raise InvalidInput("rate", f"{stated_hz:g} Hz is outside 0.01..1000 Hz")
+    rate_hz = times_hz if stated_hz is None else stated_hz
+    if rate_hz is None:
+        print(f"{drive}: no times; {ASSUMED_HZ:g} Hz is assumed (--rate HZ)", file=sys.stderr)
+    return rate_hz or ASSUMED_HZ
 
 
 def max_field_bytes() -> int:

@@ -18,9 +18,8 @@ from rfcore.image import I420
 from rfcore.localise.estimate import PoseEstimate, PoseMeasurement
 from rfcore.localise.tracker import PoseTracker
 from rfcore.views import FieldView, PosedPicture
+from rfedge.arguments import ASSUMED_HZ
 
-UNTIMED_HZ = 10.0
-"""Rate of a drive whose pictures have no times."""
 NS = 1e9
 OWN_SD_M, OWN_SD_DEG = 0.01, 0.01
 """Standard deviations that a dataset's own poses state; the tracker takes no sensor for so good."""
@@ -106,11 +105,11 @@ def own_poses(pictures: Sequence[PosedPicture]) -> list[Observation]:
 
 
 def times_of(pictures: Sequence[PosedPicture]) -> list[float]:
-    """Return the pictures' times in seconds, after 1000; those of 10 Hz where they have none."""
+    """Return the pictures' times in seconds, after 1000; at ``ASSUMED_HZ`` where they have none."""
     times_ns = [picture.time_ns for picture in pictures]
     if all(before < after for before, after in pairwise(times_ns)) and len(times_ns) > 1:
         return [1000.0 + (time_ns - times_ns[0]) / NS for time_ns in times_ns]
-    return [1000.0 + number / UNTIMED_HZ for number in range(len(pictures))]
+    return [1000.0 + number / ASSUMED_HZ for number in range(len(pictures))]
 
 
 def _measurement(seen: Observation) -> PoseMeasurement:

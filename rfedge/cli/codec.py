@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,7 +16,16 @@ from rfcore.codec.h264.config import (
     LightChange,
 )
 from rfcore.program import working
-from rfedge.arguments import DATASET, FIELD, RENDERER, check_folder, open_drive, open_field
+from rfedge.arguments import (
+    DATASET,
+    FIELD,
+    RATE,
+    RENDERER,
+    check_folder,
+    drive_rate_hz,
+    open_drive,
+    open_field,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -29,8 +38,6 @@ if TYPE_CHECKING:
     from rfedge.offline import DecodedFrame, Locate
 
 RFV = arg(metavar="FILE.rfv")
-UNTIMED_HZ = 10.0
-"""Rate of a drive whose pictures have no times."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,8 @@ class Encode:
     """Picture of the camera's size that is white where --mask-qp applies."""
     mask_qp: int = -6
     """Change of H.264's QP inside the mask, -24..24; -6 halves the quantiser's step."""
+    rate: Annotated[float | None, RATE] = None
+    """Pictures a second; default: by their times, 10 without any."""
     against_x264: bool = False
     """Also code the drive with x264 (low delay, our tools), and print the saving at equal PSNR."""
     localise: bool = False
@@ -70,6 +79,9 @@ class Encode:
         isa = renderer_isa(self.renderer)
         field = open_field(self.field, threads=self.threads, isa=isa)
         dataset = open_drive(self.drive, field, str(self.field))
+        rate_hz = drive_rate_hz(self.rate, dataset.rate_hz, self.drive)
+        if self.rate is not None:
+            dataset = _at_rate(dataset, self.rate)
         k = dataset.pictures[0].camera.intrinsics
         qp_map = MaskSettings(self.mask, self.mask_qp).qp_map((k.width_px, k.height_px))
         coding = self.coding
@@ -93,14 +105,11 @@ class Encode:
             f"{self.out}: {len(coded.frames)} frames, {size:,} bytes, "
             f"of which payload {payload_bytes:,}"
         )
-        rate_hz = dataset.rate_hz
-        rate = "no rate: the pictures have no times"
-        if rate_hz is not None:
-            kbps = 8 * size / len(coded.frames) * rate_hz / 1000
-            rate = f"{kbps:,.0f} kbit/s at {rate_hz:.4g} Hz"
+        kbps = 8 * size / len(coded.frames) * rate_hz / 1000
+        rate = f"{kbps:,.0f} kbit/s at {rate_hz:.4g} Hz"
         print(f"  {rate}, luma PSNR {quality.psnr_db:.2f} dB")
         if self.against_x264:
-            print(f"  {quality.against_x264(coded, self.crf, rate_hz or UNTIMED_HZ)}")
+            print(f"  {quality.against_x264(coded, self.crf, rate_hz)}")
 
     def _located(self, field: RadianceField, dataset: Dataset) -> Locate | None:
         """Return the function that finds the poses, or None without --localise."""
@@ -109,6 +118,15 @@ class Encode:
         from rfedge.located import LocatedDrive, own_poses
 
         return LocatedDrive(field, dataset.pictures, own_poses(dataset.pictures)).locate
+
+
+def _at_rate(dataset: Dataset, rate_hz: float) -> Dataset:
+    """Return the drive with times of the stated rate, the first at 0."""
+    pictures = (
+        replace(picture, time_ns=round(1e9 * number / rate_hz))
+        for number, picture in enumerate(dataset.pictures)
+    )
+    return replace(dataset, pictures=tuple(pictures), rate_hz=rate_hz)
 
 
 class _Quality:
@@ -179,6 +197,8 @@ class Decode:
     """Folder for the PNG files, or a file ending in .mp4."""
     originals: Annotated[Path | None, DATASET] = None
     """The drive that was encoded, to print the PSNR of what is decoded."""
+    rate: Annotated[float | None, RATE] = None
+    """Pictures a second of an MP4; default: by the frames' times, 10 without any."""
     decoder: Literal["auto", "bubblewrap", "landlock", "child", "in-process"] = "auto"
     """Sandbox of the H.264 decoder, as for mec-server; auto: the best one that works here."""
     threads: int = 2
@@ -250,12 +270,13 @@ class Decode:
         print(f"{self.out}: {len(drive.frames)} frames")
 
     def _write_film(self, drive: CodedDrive, decoded: Iterable[DecodedFrame]) -> None:
-        """Write the MP4 at the mean rate of the frames' times."""
+        """Write the MP4 at the stated rate, or at the mean rate of the frames' times."""
         from rfedge.video import write_mp4
 
         times_ns = [frame.capture_time_ns for frame in drive.frames]
         taken_s = (times_ns[-1] - times_ns[0]) / 1e9
-        rate_hz = (len(times_ns) - 1) / taken_s if taken_s > 0 else UNTIMED_HZ
+        times_hz = (len(times_ns) - 1) / taken_s if taken_s > 0 else None
+        rate_hz = drive_rate_hz(self.rate, times_hz, self.coded)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         count = write_mp4(self.out, (frame.frame for frame in decoded), rate_hz)
         print(f"{self.out}: {count} frames at {rate_hz:.4g} Hz")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import DATASET, FIELD, field_path, open_drive, open_field
+from rfedge.arguments import DATASET, FIELD, RATE, drive_rate_hz, field_path, open_drive, open_field
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,8 +44,8 @@ class Localise:
     """Seconds to add to the feed's times to get the drive's."""
     camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The camera seen from the feed's antenna: metres forward, left, up."""
-    rate: float = 10.0
-    """Pictures a second, where the dataset has no times."""
+    rate: Annotated[float | None, RATE] = None
+    """Pictures a second, for --pose-feed, where the dataset has no times; default: 10."""
     report: Annotated[Path | None, arg(metavar="FILE.html")] = None
     """Write a page: errors over time, matches drawn, what was lost and why."""
     json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
@@ -72,7 +72,8 @@ class Localise:
 
         error = parse_start_error(self.start_error)
         field = open_field(self.field, threads=self.threads)
-        pictures = open_drive(self.drive, field, str(self.field)).pictures
+        drive = open_drive(self.drive, field, str(self.field))
+        pictures = drive.pictures
         count = len(pictures) if self.tries is None else self.tries
         shown, feed = Console(stderr=True), None
         if self.pose_feed is None:
@@ -80,7 +81,8 @@ class Localise:
             searches = searches_from_displaced(field, pictures, error, count, rng)
         else:
             feed = self._feed()
-            priors = self._priors(feed, field, pictures, shown)
+            rate_hz = drive_rate_hz(self.rate, drive.rate_hz, self.drive)
+            priors = self._priors(feed, field, pictures, rate_hz, shown)
             count = sum(prior is not None for prior in priors)
             searches = searches_from(field, pictures, priors)
             error = typical_start(pictures, priors)
@@ -115,6 +117,7 @@ class Localise:
         feed: RecordedFeed,
         field: RadianceField,
         pictures: Sequence[PosedPicture],
+        rate_hz: float,
         console: Console,
     ) -> list[PosePrior | None]:
         """Return what the feed knows of each picture's pose; say what is wrong with the feed."""
@@ -124,7 +127,7 @@ class Localise:
         placement = FieldPlacement(
             field.metadata.anchor, field.metadata.tile_origin, CameraMount(self.camera_at)
         )
-        priors = feed.priors(pictures, placement, field.bounds, self.rate)
+        priors = feed.priors(pictures, placement, field.bounds, rate_hz)
         for problem, times in feed.problems.items():
             console.print(f"{self.pose_feed}: {problem}, {times} times", highlight=False)
         if not any(priors):

@@ -14,6 +14,7 @@ from rfcore.wire.drive_file import read_drive
 from rfedge.cli import parse
 from rfedge.cli.codec import Decode
 from rfedge.cli.render import Render
+from rfedge.evaluate.clips import DriveOfField
 from tests.demo.conftest import tiny_street, write_views
 
 DRIVE = "transforms_drive_vehicles.json"
@@ -57,6 +58,27 @@ def test_encode_says_rate_and_quality_and_decode_finds_the_same_quality(here, ca
 
 
 @pytest.mark.usefixtures("here")
+def test_a_rate_is_stated_or_taken_from_times_and_said_where_it_is_assumed(capsys):
+    content = json.loads(Path(DRIVE).read_text())
+    untimed = [{k: v for k, v in frame.items() if k != "time"} for frame in content["frames"]]
+    Path("untimed.json").write_text(json.dumps({**content, "frames": untimed}))
+
+    def said(*options: str, drive: str = DRIVE) -> tuple[str, str, bool]:
+        encoded(*options, drive=drive)
+        parse(["decode", "a.rfv", "--field", "street.rff", "--out", "a.mp4"]).run()
+        told = capsys.readouterr()
+        rate, film = re.search(r"bit/s at ([\d.]+) Hz[^ß]*frames at ([\d.]+) Hz", told.out).groups()
+        return rate, film, told.err.count("10 Hz is assumed (--rate HZ)") == 2
+
+    assert said() == ("10", "10", False)
+    assert said("--rate", "4") == ("4", "4", False)
+    assert said("--rate", "4", drive="untimed.json") == ("4", "4", False)
+    assert said(drive="untimed.json") == ("10", "10", True)
+    with pytest.raises(InvalidInput, match=r"rate: 0 Hz is outside 0.01..1000"):
+        encoded("--rate", "0")
+
+
+@pytest.mark.usefixtures("here")
 def test_encode_compares_with_x264_when_asked(capsys):
     encoded()
     assert "x264" not in capsys.readouterr().out
@@ -80,9 +102,19 @@ def test_a_field_far_from_every_camera_is_refused_before_anything_is_coded(here)
 
 
 @pytest.mark.usefixtures("here")
-def test_a_field_of_another_place_around_the_same_origin_is_warned_of(capsys):
+@pytest.mark.parametrize(
+    "meet",
+    [
+        lambda: encoded(field="other.rff"),
+        lambda: Render(Path("other.rff"), Path("r"), drive=Path(DRIVE)).run(),
+        lambda: parse(["localise", DRIVE, "--field", "other.rff", "--tries", "1"]).run(),
+        lambda: DriveOfField.parse(f"a@10={DRIVE},other.rff", Path("street.rff")).read(None),
+    ],
+    ids=["encode", "render", "localise", "eval"],
+)
+def test_a_field_of_another_place_around_the_same_origin_is_warned_of(capsys, meet):
     save_street_moved("other.rff", 0.0, 0.0, -13.0)
-    encoded(field="other.rff")
+    meet()
     assert re.search(r"warning: .* 1?\d\.\d dB .*rfedge field check other", capsys.readouterr().err)
 
 
