@@ -26,8 +26,8 @@ from rfcore.errors import DatasetError
 from rfcore.field import RadianceField
 from rfcore.field.interface import render_field_view
 from rfcore.native.yuv import i420_from_rgb
-from rfcore.update.passes import Pass, SeenFrame, spread
-from rfcore.views import PosedPicture
+from rfcore.update.passes import Pass, SeenFrame
+from rfcore.views import PosedPicture, spread
 from rfcore.wire.tile_manifest import TileVersions
 
 log = structlog.get_logger()

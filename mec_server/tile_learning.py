@@ -43,11 +43,11 @@ from rfcore.update.passes import (
     Pass,
     SeenFrame,
     split_frames,
-    spread,
     without_outliers,
 )
 from rfcore.update.run import LearnAs, Update, UpdateSettings, learn_from, saved_percent, try_field
 from rfcore.update.splats import FineTuning
+from rfcore.views import spread
 from rfcore.wire.tile_manifest import (
     Ground,
     TileVersions,

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from itertools import pairwise
@@ -123,9 +122,9 @@ class Dataset:
     """Posed pictures on disk, in the order of the file.
 
     ``rate_hz`` is the mean rate of the pictures' times, ``None`` unless every picture has one and
-    they increase. ``points`` is ``None`` when the dataset has none. ``changes`` says in a line each
-    what reading does to the pictures (undistorts or crops them). ``sorted_out`` counts those that
-    are listed but were deleted as blurred (``rfcore.dataset.read``). ``exposure_varies``
+    they increase. ``points`` is ``None`` when the dataset has none. ``changed`` has the names of
+    pictures by what reading does to them. ``sorted_out`` counts those that are listed but were
+    deleted as blurred (``rfcore.dataset.read``). ``exposure_varies``
     is true where the dataset says that every picture has an exposure of its own. ``anchor`` says
     where on the Earth the tile's axes are, if the dataset does.
     """
@@ -134,10 +133,17 @@ class Dataset:
     rate_hz: float | None
     points: PointCloud | None
     tile_origin: TileOrigin
-    changes: tuple[str, ...] = ()
+    changed: Mapping[str, frozenset[str]] = field(default_factory=dict)
     sorted_out: int = 0
     exposure_varies: bool = False
     anchor: Anchor | None = None
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """Lines that say what reading does to the pictures: it undistorts or crops them."""
+        names = [picture.name for picture in self.pictures]
+        counts = {what: sum(map(those.__contains__, names)) for what, those in self.changed.items()}
+        return tuple(f"{n} of {len(names)} pictures are {what}" for what, n in counts.items() if n)
 
 
 def assemble(source: Source, options: ReadOptions) -> Dataset:
@@ -157,7 +163,7 @@ def assemble(source: Source, options: ReadOptions) -> Dataset:
         rate_hz=_rate_hz(times_ns) if timed else None,
         points=localised(source.points, origin) if source.points is not None else None,
         tile_origin=origin,
-        changes=tuple(_changes(source.pictures, options.size_px)),
+        changed=_changed(source.pictures, options.size_px),
         sorted_out=source.sorted_out,
         exposure_varies=source.exposure_varies,
         anchor=source.anchor.relative_to(origin) if source.anchor is not None else None,
@@ -189,23 +195,25 @@ def _read(picture: SourcePicture, size_px: tuple[int, int] | None = None) -> Rgb
     return area_averaged(rgb[top : top + height, left : left + width], *size_px)
 
 
-def _changes(pictures: Sequence[SourcePicture], size_px: tuple[int, int] | None) -> Iterator[str]:
-    """Yield a line for pictures that are undistorted, and one for each shape that is cropped."""
-    bent = sum(picture.camera.lens is not None for picture in pictures)
-    if bent:
-        yield f"{bent} of {len(pictures)} pictures are undistorted"
-    if size_px is None:
-        return
-    cameras = [picture.camera.intrinsics for picture in pictures]
-    for from_px, count in Counter((k.width_px, k.height_px) for k in cameras).items():
+def _changed(
+    pictures: Sequence[SourcePicture], size_px: tuple[int, int] | None
+) -> dict[str, frozenset[str]]:
+    """Return the names of pictures that are undistorted, and of those of each cropped shape."""
+    changed = {"undistorted": [p.name for p in pictures if p.camera.lens is not None]}
+    for picture in pictures:
+        if size_px is None:
+            break
+        from_px = (picture.camera.intrinsics.width_px, picture.camera.intrinsics.height_px)
         _, _, *part = middle_of_shape("pictures", from_px, size_px)
         if tuple(part) != from_px:
             shapes = [f"{width}x{height}" for width, height in (from_px, part, size_px)]
-            yield (
-                f"{count} of {len(pictures)} pictures are cropped from {shapes[0]} to {shapes[1]} "
-                f"px, {part[0] * part[1] / (from_px[0] * from_px[1]):.0%} of them, which has the "
+            what = (
+                f"cropped from {shapes[0]} to {shapes[1]} px, "
+                f"{part[0] * part[1] / (from_px[0] * from_px[1]):.0%} of them, which has the "
                 f"shape of {shapes[2]}"
             )
+            changed.setdefault(what, []).append(picture.name)
+    return {what: frozenset(names) for what, names in changed.items()}
 
 
 def _pinhole(picture: SourcePicture, distortion: Distortion) -> Intrinsics:

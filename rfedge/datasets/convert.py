@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +41,12 @@ def convert_dataset(
     if step < 1 or start < 0:
         raise InvalidInput("every", "must be at least 1, and the offset at least 0")
     dataset = read_dataset(path, distortion="undistort", size_px=size_px)
-    pictures = dataset.pictures[chosen]
-    if not pictures:
-        raise InvalidInput("offset", f"leaves none of the {len(dataset.pictures)} pictures")
+    count, dataset = len(dataset.pictures), replace(dataset, pictures=dataset.pictures[chosen])
+    if not dataset.pictures:
+        raise InvalidInput("offset", f"leaves none of the {count} pictures")
     with whole_folder(out) as folder:
-        write_in_own_world(folder, dataset, enumerate(pictures), global_points(dataset))
-    return "\n".join([f"{out}: {len(pictures)} pictures", *dataset.changes])
+        write_in_own_world(folder, dataset, enumerate(dataset.pictures), global_points(dataset))
+    return "\n".join([f"{out}: {len(dataset.pictures)} pictures", *dataset.changes])
 
 
 def write_in_own_world(
