@@ -16,9 +16,10 @@ import select
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import version
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args, get_type_hints
 
 import tyro
 from tyro.conf import (
@@ -78,6 +79,19 @@ def parse_options(
     return tyro.cli(kind, prog=name, description=description, args=arguments, config=CONFIG)
 
 
+def option_names(kind: Any) -> list[str]:
+    """Return the options of a dataclass and of those in it, without dashes."""
+    types, names = get_type_hints(kind, include_extras=True), []
+    for field in fields(kind):
+        inner, *notes = get_args(types[field.name]) or (types[field.name],)
+        if is_dataclass(inner):
+            names += option_names(inner)
+        else:
+            named = (note.name for note in notes if getattr(note, "name", None))
+            names.append(next(named, field.name.replace("_", "-")))
+    return names
+
+
 def service_options(kind: Any, name: str) -> Any:
     """Return the options of service ``name``, of its command line and its ``--config`` file.
 
@@ -86,7 +100,8 @@ def service_options(kind: Any, name: str) -> Any:
     """
     from rfcore.wire.settings import configure_logs, words_of_command_line
 
-    config = parse_options(kind, name, words_of_command_line(sys.argv[1:]))
+    words = words_of_command_line(sys.argv[1:], option_names(kind))
+    config = parse_options(kind, name, words)
     configure_logs(sys.stderr, config.log)
     config.render.check()
     return config

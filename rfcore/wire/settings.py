@@ -13,8 +13,9 @@ from __future__ import annotations
 import logging
 import tomllib
 from argparse import ArgumentParser
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, TextIO
@@ -29,14 +30,17 @@ from rfcore.wire.tls import TlsFiles
 
 PORT_MAX = 65535
 OPTIONS_FILE = arg(metavar="FILE.toml")
+NEAR = 0.7
+"""Similarity from which an option is named for a key that is none (``difflib``)."""
 
 
-def words_of_command_line(words: Sequence[str]) -> list[str]:
+def words_of_command_line(words: Sequence[str], known: Collection[str]) -> list[str]:
     """Return a service's command line with the options of its ``--config FILE.toml`` in front.
 
-    A key of the file is an option without its dashes, ``_`` or ``-`` between words; true sets a
-    flag, a list gives several values. Options of the command line come later, and win. Raises
-    ``InvalidInput`` naming the file, and the key that is no option's value.
+    A key of the file is one of the ``known`` options without its dashes, ``_`` or ``-`` between
+    words; true sets a flag, a list gives several values. Options of the command line come later,
+    and win. Raises ``InvalidInput`` naming the file and the key that is no option or has no value
+    of one.
     """
     finder = ArgumentParser(add_help=False, allow_abbrev=False)
     finder.add_argument("--config", nargs="?")
@@ -49,12 +53,17 @@ def words_of_command_line(words: Sequence[str]) -> list[str]:
         raise InvalidInput("config", f"{name} cannot be read: {error}") from error
     words_of_file = []
     for key, value in options.items():
+        option = key.replace("_", "-")
+        if option not in known:
+            near = get_close_matches(option, known, 1, NEAR)
+            remedy = f"the nearest key is {near[0]}" if near else "keys are options without dashes"
+            raise InvalidInput("config", f"{name}: {key}: is no option; {remedy}")
         values = value if isinstance(value, list) else [value]
         if not values or any(isinstance(each, dict | list) for each in values):
             problem = f"{value!r} is no value of an option; tables and empty lists are none"
             raise InvalidInput("config", f"{name}: {key}: {problem}")
         if value is not False:
-            words_of_file.append(f"--{key.replace('_', '-')}")
+            words_of_file.append(f"--{option}")
             words_of_file += [] if value is True else [str(each) for each in values]
     return [*words_of_file, *words]
 
