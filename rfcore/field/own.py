@@ -28,6 +28,9 @@ from rfcore.field.quality import FULL, Quality
 from rfcore.named_class import make_named
 from rfcore.views import View
 
+MOST_MEAN = 2.0
+"""A mean of colours or opacities above this is not one of 0..1, however far some pixels overshoot;
+a picture in levels has it unless it is black."""
 _TRIED = Intrinsics(32, 18, 24.0, 24.0, 16.0, 9.0)
 
 
@@ -44,8 +47,8 @@ class OwnRenderer(Protocol):
         """64 hexadecimal digits that change with what is shown, as the SHA-256 of a checkpoint."""
 
     def render(self, camera: Camera, quality: Quality) -> View:
-        """Return what ``camera`` sees: float32 colour [H, W, 3], depth [H, W] in metres along z (0
-        where there is nothing) and opacity [H, W], 0..1. ``quality`` may be ignored."""
+        """Return what ``camera`` sees: float32 colour [H, W, 3], 0..1, depth [H, W] in metres along
+        z (0 where there is nothing) and opacity [H, W], 0..1. ``quality`` may be ignored."""
 
 
 class OwnField:
@@ -101,9 +104,13 @@ class OwnField:
             ):
                 found = getattr(array, "dtype", type(array).__name__)
                 problem = f"{found} {np.shape(array)} must be float32 {size}"
+                problem += "" if key == "depth" else ", 0..1"
                 raise InvalidInput("field", f"{self.name}.render: {key}: {problem}")
             if not np.isfinite(array).all():
                 raise InvalidInput("field", f"{self.name}.render: {key} has NaN or infinite values")
+            if key != "depth" and array.mean() > MOST_MEAN:
+                problem = f"{key} is {array.mean():.3g} on average; give 0..1, not 0..255"
+                raise InvalidInput("field", f"{self.name}.render: {problem}")
         return View(view.colour, view.depth, view.opacity)
 
     def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:

@@ -300,6 +300,15 @@ class LinkPlan:
         uplink, downlink = (replace(way, loss=loss) for way in (self.uplink, self.downlink))
         return replace(self, uplink=uplink, downlink=downlink)
 
+    def with_jitter(self, jitter: Jitter) -> LinkPlan:
+        """Return the plan with this jitter in both directions, in place of any other."""
+
+        def jittery(way: DirectionPlan) -> DirectionPlan:
+            others = [each for each in way.impairments if each.name != jitter.name]
+            return replace(way, impairments=(*others, jitter))
+
+        return replace(self, uplink=jittery(self.uplink), downlink=jittery(self.downlink))
+
     def described(self) -> str:
         """Return the link in a few words: rates, delays, what is lost and what else is done."""
         return "; ".join(

@@ -41,6 +41,12 @@ class Render:
     """Size of an orbit's pictures, px; those of a drive have the size of its camera."""
     up: Up | None = None
     """Axis of the field that points up (orbit); default: as its training cameras show it."""
+    centre: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z")] = None
+    """Point to orbit around, in the field's axes, m; default: what its training cameras look at, or
+    its middle."""
+    radius: Annotated[float | None, arg(metavar="M")] = None
+    """Distance of an orbit from that point, m; default: that of the training cameras, or 1.5 times
+    the field's radius."""
     rate_hz: float = 24.0
     """Pictures per second of the MP4."""
     detail: float = 1.0
@@ -77,9 +83,11 @@ class Render:
             self.field, threads=self.threads, isa=renderer_isa(self.renderer, self.isa)
         )
         if self.path == "orbit" or (self.path is None and self.drive is None):
-            viewpoints = orbit_viewpoints(
-                field, OrbitSettings(self.frames, *parse_size(self.size), up=self.up)
-            )
+            size_px = parse_size(self.size)
+            settings = OrbitSettings(self.frames, *size_px, self.up, self.centre, self.radius)
+            viewpoints = orbit_viewpoints(field, settings)
+        elif (self.centre, self.radius) != (None, None):
+            raise InvalidInput("centre", "and --radius are of an orbit, not of a drive")
         elif self.drive is None:
             raise InvalidInput("drive", "--path drive needs --drive, a dataset with the poses")
         else:

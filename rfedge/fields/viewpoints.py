@@ -11,6 +11,7 @@ them lie within.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,18 +46,25 @@ DISTANCE = 1.5
 
 @dataclass(frozen=True)
 class OrbitSettings:
-    """One turn; ``up``: a key of ``UPS``, None for the field's own vertical."""
+    """One turn; ``up``: a key of ``UPS``, None for the field's own vertical. ``centre_m`` and
+    ``radius_m``, the cameras' distance from it: None for those that the field suggests."""
 
     frames: int = 96
     width_px: int = 960
     height_px: int = 540
     up: str | None = None
+    centre_m: Vec3 | None = None
+    radius_m: float | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= 100_000:
             raise InvalidInput("frames", f"{self.frames} is outside 1..100000")
         if self.up is not None:
             check_up(self.up)
+        if self.centre_m is not None and not all(map(math.isfinite, self.centre_m)):
+            raise InvalidInput("centre", f"{self.centre_m} must be finite")
+        if self.radius_m is not None and not 1e-3 <= self.radius_m <= 1e6:
+            raise InvalidInput("radius", f"{self.radius_m:g} m is outside 0.001..1000000 m")
 
 
 def check_up(name: str) -> None:
@@ -70,25 +78,39 @@ def vertical(field: RadianceField, up: str | None) -> Vec3:
     return field.metadata.vertical if up is None else UPS[up]
 
 
-def orbit(field: RadianceField, settings: OrbitSettings) -> list[Camera]:
-    """Return the cameras of one turn around what the field shows."""
+@dataclass(frozen=True)
+class Orbit:
+    """The cameras of one turn, the point that they look at, and their distance from it."""
+
+    centre_m: F64
+    radius_m: float
+    cameras: list[Camera]
+
+
+def orbit(field: RadianceField, settings: OrbitSettings) -> Orbit:
+    """Return one turn around what the field shows, or around a given centre."""
     up = vertical(field, settings.up)
     turns_rad = np.linspace(0, 2 * math.pi, settings.frames, endpoint=False)
-    sights = field.metadata.sights
+    sights, given = field.metadata.sights, settings.centre_m
     middle = seen_point(sights)
     if middle is not None:
-        offsets = _among(sights, middle, up, turns_rad)
+        middle = middle if given is None else np.array(given)
+        towards, radius_m = _among(sights, middle, up, turns_rad)
     else:
-        middle, radius_m = middle_of(field)
-        offsets = DISTANCE * radius_m * _about(sights, up, turns_rad)
+        middle, reach_m = middle_of(field)
+        middle = middle if given is None else np.array(given)
+        towards, radius_m = _about(sights, up, turns_rad), DISTANCE * reach_m
+    radius_m = settings.radius_m or radius_m
     intrinsics = _intrinsics(settings.width_px, settings.height_px)
-    return [
-        Camera(intrinsics, looking_at(middle + offset, middle, np.array(up))) for offset in offsets
+    cameras = [
+        Camera(intrinsics, looking_at(middle + radius_m * way, middle, np.array(up)))
+        for way in towards
     ]
+    return Orbit(middle, radius_m, cameras)
 
 
-def _among(sights: Sequence[Sight], middle: F64, up: Vec3, turns_rad: F64) -> F64:
-    """Return offsets [N, 3] from what cameras look at, at their distance and between them."""
+def _among(sights: Sequence[Sight], middle: F64, up: Vec3, turns_rad: F64) -> tuple[F64, float]:
+    """Return unit vectors [N, 3] from what cameras look at, between them, and their distance."""
     offsets = _upright([sight.eye_m for sight in sights] - middle, up)
     ranges_m = np.linalg.norm(offsets, axis=1)
     elevations_rad = np.arcsin(offsets[:, 2] / np.maximum(ranges_m, 1e-9))
@@ -103,7 +125,7 @@ def _among(sights: Sequence[Sight], middle: F64, up: Vec3, turns_rad: F64) -> F6
         rise_rad = SWING * float(np.ptp(elevations_rad)) / 2
         middle_rad = azimuths_rad[last] - half_rad, float(elevations_rad.mean())
         towards = _to_and_fro(middle_rad, (half_rad, rise_rad), up, turns_rad)
-    return np.asarray(np.median(ranges_m) * towards)
+    return towards, float(np.median(ranges_m))
 
 
 def _about(sights: Sequence[Sight], up: Vec3, turns_rad: F64) -> F64:
@@ -185,9 +207,14 @@ class Viewpoint:
 
 
 def orbit_viewpoints(field: RadianceField, settings: OrbitSettings) -> list[Viewpoint]:
-    """Return the viewpoints of one turn around the field."""
-    cameras = orbit(field, settings)
-    return [Viewpoint(f"{number:05d}", camera) for number, camera in enumerate(cameras)]
+    """Return the viewpoints of one turn around the field; say on stderr around what."""
+    turn = orbit(field, settings)
+    x, y, z = turn.centre_m
+    print(
+        f"orbit around {x:.2f} {y:.2f} {z:.2f} at {turn.radius_m:.2f} m (--centre, --radius)",
+        file=sys.stderr,
+    )
+    return [Viewpoint(f"{number:05d}", camera) for number, camera in enumerate(turn.cameras)]
 
 
 def drive_viewpoints(pictures: Iterable[PosedPicture]) -> list[Viewpoint]:

@@ -49,6 +49,9 @@ class LinkSettings:
     them again: nothing is damaged, what comes is late and less."""
     loss_burst: Annotated[float, arg(metavar="PACKETS")] = 1.0
     """Packets that `--loss` takes in a row, on average."""
+    jitter_ms: Annotated[float | None, arg(metavar="MS")] = None
+    """Longest random delay on top of the constant one, in either direction, ms; also beside a
+    profile, in place of its jitter. Uniform from 0; what is behind waits."""
     metrics_port: Annotated[int | None, arg(metavar="PORT")] = None
     """Port for Prometheus; 0 takes a free one, none are served without it."""
     metrics_host: Annotated[str, arg(metavar="HOST")] = "127.0.0.1"
@@ -93,13 +96,15 @@ class LinkSettings:
     def plan(self) -> LinkPlan:
         """Return what the link is made of; raise what reading ``profile`` raises."""
         from rfcore.link.lossy import PacketLoss
-        from rfcore.link.plan import LinkPlan, read_link
+        from rfcore.link.plan import Jitter, LinkPlan, read_link
 
         if self.profile is not None:
             plan = read_link(self.profile)
         else:
             plan = LinkPlan(self._constant(self.uplink_bps), self._constant(self.downlink_bps))
-        return plan.with_loss(PacketLoss(self.loss, self.loss_burst)) if self.loss else plan
+        if self.loss:
+            plan = plan.with_loss(PacketLoss(self.loss, self.loss_burst))
+        return plan if self.jitter_ms is None else plan.with_jitter(Jitter(self.jitter_ms / 1e3))
 
     def _constant(self, rate_bps: float | None) -> DirectionPlan:
         from rfcore.link.plan import DirectionPlan

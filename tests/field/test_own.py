@@ -55,6 +55,23 @@ def test_a_view_of_another_form_is_refused_when_the_class_is_loaded(key, change)
         OwnField(Wall(**{key: change}), "walls.Wall")
 
 
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("colour", lambda a: 255 * a),
+        ("colour", lambda a: (255 * a).astype(np.uint8)),
+        ("opacity", lambda a: 255 * a),
+    ],
+)
+def test_a_picture_in_levels_is_named_as_such(key, change):
+    with pytest.raises(InvalidInput, match=rf"{key}.* 0\.\.1"):
+        OwnField(Wall(**{key: change}), "walls.Wall")
+    bright = np.float32(1.5)
+    assert (
+        OwnField(Wall(colour=lambda a: a * 2 * bright), "w").render(CAMERA).colour.max() == bright
+    )
+
+
 @pytest.mark.parametrize("field_id", ["", "street", "5A" * 32, None, 7])
 def test_an_id_that_is_no_digest_is_refused(field_id):
     wall = Wall()

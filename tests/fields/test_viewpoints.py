@@ -14,7 +14,7 @@ from rfedge.fields.viewpoints import UPS, OrbitSettings, look_around, looking_at
 @pytest.mark.parametrize("up", sorted(UPS))
 def test_an_orbit_keeps_the_middle_in_the_middle_and_up_upright(place, up):
     middle = np.median(place.field.gaussians.means, axis=0)
-    cameras = orbit(place.field, OrbitSettings(frames=7, width_px=64, height_px=48, up=up))
+    cameras = orbit(place.field, OrbitSettings(frames=7, width_px=64, height_px=48, up=up)).cameras
     assert len(cameras) == 7
     for camera in cameras:
         u_px, v_px, depth_m = camera.project(middle.tolist())
@@ -49,7 +49,7 @@ ASKEW = Pose((3.0, -7.0, 2.0), (0.1, -0.7, 0.5, 0.5))
 def test_an_orbit_of_an_object_stays_where_it_was_photographed_from(turn):
     """From a quarter of its sides: to and fro between them."""
     field = photographed(np.linspace(-45, 45, 9), turn)
-    for camera in orbit(field, OrbitSettings(frames=12, width_px=64, height_px=48)):
+    for camera in orbit(field, OrbitSettings(frames=12, width_px=64, height_px=48)).cameras:
         u_px, v_px, depth_m = camera.project(turn.apply(OBJECT_M))
         assert (u_px, v_px) == pytest.approx((32, 24), abs=2)
         assert depth_m == pytest.approx(np.hypot(4, 1), abs=0.2)
@@ -62,7 +62,7 @@ def test_an_orbit_of_an_object_stays_where_it_was_photographed_from(turn):
 
 def test_an_orbit_of_an_object_photographed_all_around_goes_all_around():
     field = photographed(np.arange(0, 360, 45), Pose.identity())
-    eyes = [c.world_from_cam.translation_m for c in orbit(field, OrbitSettings(frames=8))]
+    eyes = [c.world_from_cam.translation_m for c in orbit(field, OrbitSettings(frames=8)).cameras]
     sides = np.degrees([np.arctan2(y + 3, x - 2) for x, y, _ in eyes])
     np.testing.assert_allclose(np.diff(np.sort(sides)), 45, atol=3)
 
@@ -92,7 +92,7 @@ def test_a_field_is_first_seen_by_the_camera_that_aims_best_or_by_the_middle_one
 def test_an_orbit_stays_behind_cameras_that_all_look_one_way(place):
     way = rotated(ASKEW, (1.0, 0.0, 0.0))
     metadata = FieldMetadata(up=rotated(ASKEW, Z_UP), sights=(Sight((0.0, 0.0, 0.0), way),) * 4)
-    cameras = orbit(place.field.described(metadata), OrbitSettings(frames=8))
+    cameras = orbit(place.field.described(metadata), OrbitSettings(frames=8)).cameras
     ahead = [np.array(c.world_from_cam.rotation_matrix())[:, 2] @ way for c in cameras]
     assert min(ahead) > 0.7
 
@@ -107,9 +107,19 @@ def test_four_cameras_look_around_from_the_middle(place):
     assert all(place.field.render(c).opacity.mean() > 0.2 for c in cameras)
 
 
+@pytest.mark.parametrize("is_object", [False, True])
+def test_a_given_centre_and_radius_are_kept(place, is_object):
+    field = photographed([-20, 0, 20], Pose.identity()) if is_object else place.field
+    settings = OrbitSettings(frames=7, centre_m=(4.0, -5.0, 6.0), radius_m=2.5)
+    for camera in orbit(field, settings).cameras:
+        pose = camera.world_from_cam
+        ahead_m = pose.inverse().apply(settings.centre_m)
+        assert ahead_m == pytest.approx((0.0, 0.0, 2.5), abs=1e-6)
+
+
 def test_an_empty_field_can_be_orbited():
     nothing = Gaussians(*(np.zeros((0, *s), "f4") for s in ((3,), (4,), (3,), (), (1, 3))))
-    assert len(orbit(SplatField(nothing), OrbitSettings(frames=2))) == 2
+    assert len(orbit(SplatField(nothing), OrbitSettings(frames=2)).cameras) == 2
 
 
 def test_a_camera_looks_where_it_is_told():
@@ -118,7 +128,9 @@ def test_a_camera_looks_where_it_is_told():
     np.testing.assert_allclose(pose.apply((0, 1, 0)), (1, 2, 2), atol=1e-12)
 
 
-@pytest.mark.parametrize("wrong", [{"frames": 0}, {"up": "x"}])
+@pytest.mark.parametrize(
+    "wrong", [{"frames": 0}, {"up": "x"}, {"radius_m": 0.0}, {"centre_m": (np.nan, 0.0, 0.0)}]
+)
 def test_an_orbit_that_is_none_is_refused(wrong):
-    with pytest.raises(InvalidInput, match=next(iter(wrong))):
+    with pytest.raises(InvalidInput, match=next(iter(wrong)).removesuffix("_m")):
         OrbitSettings(**wrong)

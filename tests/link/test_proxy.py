@@ -11,10 +11,12 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.link.lossy import PacketLoss
+from rfcore.link.plan import Arrival, delivery_times
 from rfcore.link.shaper import Link, LinkProfile
 from rfedge.link import LinkSettings
 from rfedge.link.direction import Direction, Side
@@ -248,6 +250,22 @@ async def test_lost_packets_cost_time_and_no_byte() -> None:
 def test_loss_goes_with_a_profile(profile: Callable[..., Path]) -> None:
     plan = LinkSettings("127.0.0.1:1", profile=profile(), loss=2.0, loss_burst=3.0).plan()
     assert plan.uplink.loss == plan.downlink.loss == PacketLoss(2.0, 3.0)
+
+
+@pytest.mark.parametrize("with_profile", [False, True])
+def test_jitter_delays_by_up_to_its_spread(
+    profile: Callable[..., Path], with_profile: bool
+) -> None:
+    asked = {"profile": profile()} if with_profile else {}
+    plain, jittery = (
+        LinkSettings("127.0.0.1:1", jitter_ms=ms, **asked).plan().uplink for ms in (None, 30.0)
+    )
+    packets = [Arrival(float(second), 100) for second in range(200)]
+    late_s = np.subtract(*(delivery_times(way, packets) for way in (jittery, plain)))
+    assert 0 <= late_s.min() < 0.002
+    assert 0.028 < late_s.max() <= 0.03
+    with pytest.raises(InvalidInput, match="jitter"):
+        LinkSettings("127.0.0.1:1", jitter_ms=-1.0).check()
 
 
 def test_the_command_says_at_once_where_it_listens_also_through_a_pipe() -> None:
