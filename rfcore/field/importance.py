@@ -17,7 +17,7 @@ of ``seen_directions`` and bits by the frequencies of each coefficient's numbers
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -59,7 +59,7 @@ def contributions(
 
 def seen_directions(
     gaussians: Gaussians,
-    cameras: Sequence[Camera],
+    cameras: Iterable[Camera],
     *,
     threads: int = 1,
     antialiased: bool = False,
@@ -181,7 +181,7 @@ def _harmonics(means: F32, camera: Camera) -> F32:
 
 
 def _weights(
-    gaussians: Gaussians, cameras: Sequence[Camera], threads: int, antialiased: bool
+    gaussians: Gaussians, cameras: Iterable[Camera], threads: int, antialiased: bool
 ) -> Iterator[tuple[Camera, F64]]:
     """Yield each camera and the blending weight [N] of every splat over its pixels."""
     if not cameras:

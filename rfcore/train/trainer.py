@@ -303,6 +303,19 @@ def held_out_quality(field: RadianceField, pictures: Sequence[PosedPicture]) -> 
     )
 
 
+def mean_picture_db(shown: Sequence[PosedPicture], seen: Sequence[PosedPicture]) -> float:
+    """Return the mean PSNR of ``seen`` where one picture stands for them all, as if nothing were
+    learnt: the mean of ``shown``, or its colour where sizes differ."""
+    cameras = [picture.camera.intrinsics for picture in (*shown, *seen)]
+    sizes = {(k.width_px, k.height_px) for k in cameras}
+    colours = [picture.read() / 255.0 for picture in shown]
+    if len(sizes) > 1:
+        colours = [colour.mean(axis=(0, 1), keepdims=True) for colour in colours]
+    mean = np.mean(colours, axis=0)
+    pairs = [(np.broadcast_to(mean, rgb.shape), rgb / 255.0) for rgb in (p.read() for p in seen)]
+    return float(np.mean([psnr(*pair, peak=1.0) for pair in pairs]))
+
+
 def _check(pictures: Sequence[PosedPicture]) -> None:
     if not pictures:
         raise InvalidInput("pictures", "at least one is needed to measure a field")

@@ -10,9 +10,11 @@ field and stream over a number of passes. For the latter it codes the stream as 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from time import monotonic
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -40,8 +42,14 @@ MOST_CAMERAS = 60
 """Number of cameras, evenly spread, from which the visible directions of splats are taken."""
 TRIAL_FRAMES = 8
 """Consecutive frames that are coded against every size."""
-AFTER_LEVELS = 0.4
-"""Share of the time left of a run that compressing and measuring the field may take."""
+FEWEST_CAMERAS = 12
+"""The same in a run that has little time left."""
+SEEN_SHARE = 0.3
+"""Share of what is left of a run that may be spent on visible directions."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Its multiples, without their whole part, are spread evenly wherever they end."""
+TRIED_SPLATS = 16
+"""Every so many splats are compressed to see how long it takes."""
 LEVELS_SHARE = 1.15
 """Upper bound of what fitted levels multiply a field's bytes by; 1.12 on the first sample."""
 
@@ -104,7 +112,8 @@ class FieldSizer:
     """Brings a field to the size that a goal asks for.
 
     ``views`` say from where splats are seen; their pixels are not read. ``drive`` has the pictures
-    of a pass in their order; they are coded to choose a size for ``SizeGoal.passes``.
+    of a pass in their order; they are coded to choose a size for ``SizeGoal.passes``. With
+    ``left_s``, levels leave ``after_s`` seconds of it.
     """
 
     def __init__(
@@ -114,8 +123,9 @@ class FieldSizer:
         config: LevelFitConfig,
         console: Console,
         left_s: SecondsLeft | None = None,
+        after_s: float = 0.0,
     ) -> None:
-        self._left_s = left_s
+        self._left_s, self._after_s = left_s, after_s
         self._cameras = [view.camera for view in views]
         self._seen_from = [view.camera for view in spread(views, MOST_CAMERAS)]
         self._drive = drive
@@ -185,18 +195,68 @@ class FieldSizer:
         return _with_splats(field, fitted(kept, full, self._cameras, config) if fit else kept, {})
 
     def _with_levels(self, field: SplatField) -> SplatField:
-        return fit_levels(field, self._cameras, self._config, self._console, self._left_s)
+        left_s, after_s = self._left_s, self._after_s
+        fit_left_s = None if left_s is None else lambda: left_s() - after_s
+        return fit_levels(field, self._cameras, self._config, self._console, fit_left_s)
 
     def _frugal(self, field: SplatField, size: FieldSize) -> SplatField:
         """Return the compressed field, with colours simplified in directions nobody sees."""
+        taken: list[Camera] = []
         seen = seen_directions(
             field.gaussians,
-            self._seen_from,
+            self._while_time(taken),
             threads=self._config.threads,
             antialiased=field.metadata.antialiased,
         )
-        colours = frugal_colours(field.gaussians, seen, size.steps, size.price)
+        price = size.price * len(taken) / max(len(self._seen_from), 1)
+        colours = frugal_colours(field.gaussians, seen, size.steps, price)
         return _with_splats(field, colours, field.levels).compressed(size.steps, size.grain)
+
+    def _while_time(self, taken: list[Camera]) -> Iterator[Camera]:
+        """Yield cameras that visible directions are taken from, all over the drive, as long as
+        there is time; note them in ``taken``."""
+        cameras, left_s = self._seen_from, self._left_s
+        until_s = 0.0
+        if left_s is not None:
+            in_turn = sorted(range(len(cameras)), key=lambda index: index * GOLDEN % 1)
+            cameras, until_s = [cameras[index] for index in in_turn], (1 - SEEN_SHARE) * left_s()
+        for camera in cameras:
+            if left_s is not None and len(taken) >= FEWEST_CAMERAS and left_s() <= until_s:
+                return
+            taken.append(camera)
+            yield camera
+
+
+def finishing_s(
+    field: SplatField,
+    views: Sequence[PosedPicture],
+    held_out: Sequence[PosedPicture],
+    threads: int,
+) -> float:
+    """Return how long ordering splats, compressing and measuring a field takes at least, from
+    doing a part of each."""
+    few = reordered(field.gaussians, np.arange(0, field.primitives, TRIED_SPLATS))
+    part, config = _with_splats(field, few, {}), LevelFitConfig(threads=threads)
+    camera = views[0].camera
+    sizer = FieldSizer(views[:1], (), config, Console(quiet=True))
+    compressing_s = TRIED_SPLATS * _seconds(lambda: sizer._frugal(part, SIZES[0]))
+    antialiased = field.metadata.antialiased
+    looking_s = len(views) * _seconds(
+        lambda: contributions(field.gaussians, [camera], threads=threads, antialiased=antialiased)
+    )
+    seeing_s = FEWEST_CAMERAS * _seconds(
+        lambda: seen_directions(field.gaussians, [camera], threads=threads)
+    )
+    measuring_s = 0.0
+    if held_out:
+        measuring_s = len(held_out) * _seconds(lambda: held_out_quality(field, held_out[:1]))
+    return compressing_s + looking_s + seeing_s + measuring_s
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    began_s = monotonic()
+    work()
+    return monotonic() - began_s
 
 
 def _with_splats(field: SplatField, gaussians: Gaussians, levels: LevelsOfDetail) -> SplatField:
@@ -237,7 +297,8 @@ def finish_field(
     compress and to measure. Passes are like ``held_out``, or like ``views`` if that is empty; then
     the header states no quality.
     """
-    sizer = FieldSizer(views, held_out or views, config, console, left_s)
+    after_s = 0.0 if left_s is None else finishing_s(field, views, held_out, config.threads)
+    sizer = FieldSizer(views, held_out or views, config, console, left_s, after_s)
     small = sizer.sized(field, goal if goal is not None else SizeGoal())
     if not held_out:
         return small
@@ -255,7 +316,6 @@ def fit_levels(
     left_s: SecondsLeft | None = None,
 ) -> SplatField:
     """Return the field with lower levels of detail fitted to ``cameras``, showing progress."""
-    after_s = AFTER_LEVELS * left_s() if left_s is not None else 0.0
     columns = (
         TextColumn("levels of detail"),
         BarColumn(),
@@ -268,5 +328,4 @@ def fit_levels(
         def show(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        fit_left_s = None if left_s is None else lambda: left_s() - after_s
-        return with_levels(field, cameras, config, show, left_s=fit_left_s)
+        return with_levels(field, cameras, config, show, left_s=left_s)

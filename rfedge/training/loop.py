@@ -69,7 +69,7 @@ class TrainingLoop:
     """Runs a trainer to its end. ``clock`` returns seconds that never go back.
 
     ``show`` is called with the trainer after each iteration (``rfedge.training.view``); its time
-    does not count as training.
+    does not count as training. ``begun_s``: seconds of the run before the loop, which count too.
     """
 
     def __init__(
@@ -79,13 +79,15 @@ class TrainingLoop:
         measure: Measure | None,
         clock: Callable[[], float],
         show: Callable[[FieldTrainer], None] | None = None,
+        begun_s: float = 0.0,
     ) -> None:
         self.trainer = trainer
         self._show = show
         self.curve: list[tuple[float, float]] = []
         """Seconds of training and held-out PSNR in dB."""
         self._limits, self._measure, self._clock = limits, measure, clock
-        self._before_s = self._aside_s = self._elapsed_before_s = 0.0
+        self._before_s = self._aside_s = 0.0
+        self._elapsed_before_s = begun_s
         self._started_s = clock()
 
     @property
@@ -125,7 +127,8 @@ class TrainingLoop:
         checkpoint = read_checkpoint(self._limits.checkpoint)
         self.trainer.restore(checkpoint)
         loop = checkpoint.values["loop"]
-        self._before_s, self._elapsed_before_s = float(loop["seconds"]), float(loop["elapsed_s"])
+        self._before_s = float(loop["seconds"])
+        self._elapsed_before_s += float(loop["elapsed_s"])
         self.curve = [(float(s), float(db)) for s, db in loop["curve"]]
         self._started_s, self._aside_s = self._clock(), 0.0
 

@@ -28,6 +28,7 @@ from rfcore.camera import Camera, TileOrigin
 from rfcore.dataset import Dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
+from rfcore.field.place import FITS_DB
 from rfcore.files import write_whole
 from rfcore.image import Rgb
 from rfcore.ngp.shape import FEATURES
@@ -35,11 +36,18 @@ from rfcore.train.ngp import NgpModel, NgpTrainer, NgpTrainingConfig
 from rfcore.train.poses import PoseCorrection, align_pictures
 from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.train.start import random_points
-from rfcore.train.trainer import FieldTrainer, HeldOut, held_out_quality, mean_psnr_db
+from rfcore.train.trainer import (
+    FieldTrainer,
+    HeldOut,
+    held_out_quality,
+    mean_picture_db,
+    mean_psnr_db,
+)
 from rfcore.vertical import Z_UP, direction, vertical_of
-from rfcore.views import PosedPicture
+from rfcore.views import PosedPicture, spread
 from rfedge.arguments import time_text
 from rfedge.results import make_result, provenance
+from rfedge.training.finish import finishing_s
 from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing
 
 
@@ -163,6 +171,12 @@ def check_memory(needed: int, available: int | None) -> None:
         )
 
 
+JUDGED, MEANT = 8, 16
+"""Pictures by which a field is judged, and those whose mean it has to beat."""
+PASSES = 10
+"""Iterations for each picture below which a run is short."""
+LEVELS_SHARE = 0.05
+"""Share of a run limited by time that fitting levels of detail has at least."""
 UNLIMITED_ITERATIONS = 1_000_000
 """Iterations of a run that ends by the clock."""
 
@@ -233,18 +247,20 @@ def train(
     ``show`` is that of ``TrainingLoop``. Raises ``InvalidInput`` if there is too little memory, and
     ``TrainingDiverged`` when the run is lost; the last good checkpoint stays.
     """
+    began_s = monotonic()
     _announce(job, console)
     trainer = _trainer(job)
+    limits = _leaving_time_to_finish(job, trainer, began_s, console)
     measure = None
     if job.held_out is not None:
         measure = partial(mean_psnr_db, pictures=_in_memory(job.held_out.pictures))
-    loop = TrainingLoop(trainer, job.limits, measure, monotonic, show)
+    loop = TrainingLoop(trainer, limits, measure, monotonic, show, monotonic() - began_s)
     if job.resume:
         loop.resume()
         console.print(f"  going on after iteration {trainer.iteration:,}, {loop.seconds:.0f} s")
     run_showing(loop, console, monotonic)
     seconds = loop.seconds
-    quality = _quality(trainer, job)
+    quality = None if limits.kept_s else _quality(trainer, job)  # else that as written will do
     _announce_end(seconds, quality, console)
     field = trainer.field(job.name, job.dataset.tile_origin, quality, job.dataset.anchor)
     aligned = None
@@ -262,6 +278,28 @@ def train(
         curve=tuple(loop.curve),
         ends_s=math.inf if loop.left_s is None else monotonic() + loop.left_s,
     )
+
+
+def _leaving_time_to_finish(
+    job: TrainingJob, trainer: FieldTrainer, begun_s: float, console: Console
+) -> LoopLimits:
+    """Return the limits with as much time kept as finishing is seen to take here and now, at most
+    half of what is left."""
+    limits, held_out = job.limits, job.held_out
+    field = trainer.field() if limits.kept_s and limits.minutes is not None else None
+    if limits.minutes is None or not isinstance(field, SplatField):
+        return limits
+    seen = () if held_out is None else held_out.pictures
+    finish_s = finishing_s(field, job.dataset.pictures, seen, job.config.threads)
+    most_s = max(60 * limits.minutes - (monotonic() - begun_s), 0) / 2
+    kept_s = max(limits.kept_s, min(finish_s + LEVELS_SHARE * 60 * limits.minutes, most_s))
+    late_s = finish_s - most_s
+    late = f"; it will end about {time_text(late_s)} late" if late_s > 1 else ""
+    console.print(
+        f"  the last {time_text(kept_s)} are for levels of detail and compression{late}",
+        highlight=False,
+    )
+    return replace(limits, kept_s=kept_s)
 
 
 def _trainer(job: TrainingJob) -> FieldTrainer:
@@ -298,8 +336,6 @@ def _announce(job: TrainingJob, console: Console) -> None:
     length = f"{config.iterations:,} iterations"
     if job.limits.minutes is not None:
         length = f"{job.limits.minutes:g} minutes"
-        if job.limits.kept_s:
-            length += f", the last {time_text(job.limits.kept_s)} for levels of detail"
     console.print(
         f"[bold]Training[/] {what} on {len(pictures)} pictures, {length}; about "
         f"{needed / 2**30:.1f} GiB of memory"
@@ -327,6 +363,41 @@ def _quality(trainer: FieldTrainer, job: TrainingJob) -> HeldOut | None:
     if job.held_out is None:
         return None
     return held_out_quality(trainer.field(), job.held_out.pictures)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run came to, in a line, and whether the field is of use: it shows pictures better than
+    the mean of those it was trained on does, put in the place of each."""
+
+    text: str
+    is_useful: bool
+
+
+def outcome_of(job: TrainingJob, trained: Trained, field: RadianceField) -> Outcome:
+    """Judge a finished field by its held-out pictures; without any by some it was trained on."""
+    shown = job.dataset.pictures
+    seen = spread(shown if job.held_out is None else job.held_out.pictures, JUDGED)
+    psnr_db = field.metadata.held_out_psnr_db
+    if psnr_db is None:
+        psnr_db = mean_psnr_db(field, seen)
+    kind = "of training pictures" if job.held_out is None else "held out"
+    text = f"{psnr_db:.2f} dB {kind} after {trained.iterations:,} iterations"
+    mean_db = mean_picture_db(spread(shown, MEANT), seen)
+    few = trained.iterations < PASSES * len(shown)
+    more = "--minutes" if job.limits.minutes is not None else "--iterations"
+    remedy = "check its poses (rfedge field check), or give points (--points)"
+    if few:
+        remedy = f"these are few for {len(shown)} pictures: give more {more}, or a smaller --size"
+    if psnr_db <= mean_db:
+        problem = f"no better than the mean picture ({mean_db:.2f} dB): of no use"
+        return Outcome(f"{text}, {problem}; {remedy}", False)
+    if psnr_db < FITS_DB:
+        problem = f"below {FITS_DB:g} dB commands take it for a field of another place"
+        return Outcome(f"{text}; {problem}; {remedy}", True)
+    if job.held_out is None:
+        return Outcome(f"{text}; --holdout 8 says how good other views are", True)
+    return Outcome(text, True)
 
 
 def _in_memory(pictures: Sequence[PosedPicture]) -> list[PosedPicture]:

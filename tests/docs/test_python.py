@@ -1,5 +1,6 @@
 """The program of docs/how-to/python.md runs as it stands there."""
 
+import re
 import subprocess
 import sys
 
@@ -21,6 +22,8 @@ def test_the_program_renders_encodes_and_decodes(tmp_path):
         [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    first, *sizes = done.stdout.splitlines()
+    first, *frames = done.stdout.splitlines()
     assert first == "(90, 160, 3) (90, 160) (90, 160)"
-    assert [line.split()[0] for line in sizes] == ["0", "1", "2"]
+    found = [re.fullmatch(r"(\d): (\d+) bytes, ([\d.]+) dB", line) for line in frames]
+    assert [line[1] for line in found] == ["0", "1", "2"]
+    assert all(int(line[2]) > 20 and float(line[3]) > 20 for line in found)

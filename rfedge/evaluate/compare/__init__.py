@@ -41,7 +41,7 @@ class EvalCompare(Experiment):
     out: Path = Path("out/eval/compare.json")
     cells: Path = Path("out/eval/compare")
     method: tuple[str, ...] = ()
-    """More codecs to compare with, as package.module:Class (see docs/explanation/evaluation.md)."""
+    """More codecs to compare with, as package.module:Class (docs/how-to/compare.md)."""
     rivals: tuple[str, ...] = ()
     """Compare with these rivals only, such as x264-our-tools-medium, and by PSNR only. Another
     name lists them. x264-lowdelay-psnr is added: a field's own bytes are counted against it."""
