@@ -303,17 +303,13 @@ def held_out_quality(field: RadianceField, pictures: Sequence[PosedPicture]) -> 
     )
 
 
-def mean_picture_db(shown: Sequence[PosedPicture], seen: Sequence[PosedPicture]) -> float:
-    """Return the mean PSNR of ``seen`` where one picture stands for them all, as if nothing were
-    learnt: the mean of ``shown``, or its colour where sizes differ."""
-    cameras = [picture.camera.intrinsics for picture in (*shown, *seen)]
-    sizes = {(k.width_px, k.height_px) for k in cameras}
-    colours = [picture.read() / 255.0 for picture in shown]
-    if len(sizes) > 1:
-        colours = [colour.mean(axis=(0, 1), keepdims=True) for colour in colours]
-    mean = np.mean(colours, axis=0)
-    pairs = [(np.broadcast_to(mean, rgb.shape), rgb / 255.0) for rgb in (p.read() for p in seen)]
-    return float(np.mean([psnr(*pair, peak=1.0) for pair in pairs]))
+def mean_colour_db(shown: Sequence[PosedPicture], seen: Sequence[PosedPicture]) -> float:
+    """Return the mean PSNR of ``seen`` against the mean colour of ``shown`` everywhere: what knows
+    nothing of a place has."""
+    colour = np.mean([picture.read().mean(axis=(0, 1)) / 255.0 for picture in shown], axis=0)
+    pictures = [picture.read() / 255.0 for picture in seen]
+    flat = [np.broadcast_to(colour, rgb.shape) for rgb in pictures]
+    return float(np.mean([psnr(*pair, peak=1.0) for pair in zip(flat, pictures, strict=True)]))
 
 
 def _check(pictures: Sequence[PosedPicture]) -> None:

@@ -207,7 +207,7 @@ class Train:
             write_training_report(self.report, result, field, job.held_out)
             console.print(f"{self.report}: held-out pictures and the curve over time")
         outcome = outcome_of(job, trained, field)
-        if not outcome.is_useful:
+        if outcome.is_failure:
             raise RfedgeError(f"{self.out}: {outcome.text}")
         console.print(f"  {outcome.text}", highlight=False)
 

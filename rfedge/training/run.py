@@ -40,7 +40,7 @@ from rfcore.train.trainer import (
     FieldTrainer,
     HeldOut,
     held_out_quality,
-    mean_picture_db,
+    mean_colour_db,
     mean_psnr_db,
 )
 from rfcore.vertical import Z_UP, direction, vertical_of
@@ -172,7 +172,7 @@ def check_memory(needed: int, available: int | None) -> None:
 
 
 JUDGED, MEANT = 8, 16
-"""Pictures by which a field is judged, and those whose mean it has to beat."""
+"""Pictures by which a field is judged, and those whose mean colour it has to beat."""
 PASSES = 10
 """Iterations for each picture below which a run is short."""
 LEVELS_SHARE = 0.05
@@ -367,11 +367,11 @@ def _quality(trainer: FieldTrainer, job: TrainingJob) -> HeldOut | None:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run came to, in a line, and whether the field is of use: it shows pictures better than
-    the mean of those it was trained on does, put in the place of each."""
+    """What a run came to, in a line. It failed if the field is no nearer to pictures than the mean
+    colour of those that it was trained on; a few iterations that were asked for are no failure."""
 
     text: str
-    is_useful: bool
+    is_failure: bool
 
 
 def outcome_of(job: TrainingJob, trained: Trained, field: RadianceField) -> Outcome:
@@ -383,21 +383,22 @@ def outcome_of(job: TrainingJob, trained: Trained, field: RadianceField) -> Outc
         psnr_db = mean_psnr_db(field, seen)
     kind = "of training pictures" if job.held_out is None else "held out"
     text = f"{psnr_db:.2f} dB {kind} after {trained.iterations:,} iterations"
-    mean_db = mean_picture_db(spread(shown, MEANT), seen)
+    mean_db = mean_colour_db(spread(shown, MEANT), seen)
     few = trained.iterations < PASSES * len(shown)
     more = "--minutes" if job.limits.minutes is not None else "--iterations"
     remedy = "check its poses (rfedge field check), or give points (--points)"
     if few:
         remedy = f"these are few for {len(shown)} pictures: give more {more}, or a smaller --size"
     if psnr_db <= mean_db:
-        problem = f"no better than the mean picture ({mean_db:.2f} dB): of no use"
-        return Outcome(f"{text}, {problem}; {remedy}", False)
+        problem = f"no better than their mean colour ({mean_db:.2f} dB): of no use"
+        was_asked_for = few and job.limits.minutes is None
+        return Outcome(f"{text}, {problem}; {remedy}", not was_asked_for)
     if psnr_db < FITS_DB:
         problem = f"below {FITS_DB:g} dB commands take it for a field of another place"
-        return Outcome(f"{text}; {problem}; {remedy}", True)
+        return Outcome(f"{text}; {problem}; {remedy}", False)
     if job.held_out is None:
-        return Outcome(f"{text}; --holdout 8 says how good other views are", True)
-    return Outcome(text, True)
+        return Outcome(f"{text}; --holdout 8 says how good other views are", False)
+    return Outcome(text, False)
 
 
 def _in_memory(pictures: Sequence[PosedPicture]) -> list[PosedPicture]:

@@ -1,6 +1,8 @@
 """``rfedge train`` writes a field, a result, a page; interrupted, it ends with the same bytes."""
 
+import io
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,11 +12,14 @@ import pytest
 from rich.console import Console
 
 from rfcore.dataset import read_dataset
-from rfcore.errors import DatasetError, InvalidInput
+from rfcore.dataset.source import SourcePoints
+from rfcore.dataset.write import write_points
+from rfcore.errors import DatasetError, InvalidInput, RfedgeError
 from rfcore.field import load_field, save_field
 from rfcore.train.ngp import NgpModel, NgpTrainingConfig
 from rfedge.cli.dataset import DatasetConvert
-from rfedge.training import Train
+from rfedge.training import Train, run
+from rfedge.training.finish import finishing_s
 from rfedge.training.loop import LoopLimits
 from rfedge.training.run import TrainingJob, train, training_result
 from rfedge.training.views import (
@@ -48,8 +53,9 @@ def test_a_preset_sets_what_is_not_given_and_says_so(wall, tmp_path, capsys):
         for more in ({"preset": "street"}, {"antialiased": True})
     )
     preset.run()
-    assert "--antialiased" in (said := capsys.readouterr().err)
-    assert not any(word in said for word in ("--sh-degree", "--limit", "--minutes"))
+    chosen, given_words = capsys.readouterr().err.strip().split("; given: ")
+    assert chosen == "preset street: --antialiased"
+    assert given_words == "--limit 60 --sh-degree 2 --iterations 20"
     written = preset.out.read_bytes()
     plain.run()
     assert plain.out.read_bytes() == written
@@ -122,9 +128,61 @@ def test_an_interrupted_run_ends_with_the_same_bytes(wall, tmp_path):
     assert broken.read_bytes() == whole.read_bytes()
 
 
-def test_a_run_may_be_limited_by_time(wall, tmp_path):
+def test_a_run_may_be_limited_by_time(wall, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "mean_colour_db", lambda *_: 0.0)  # a second is too short
     verb(wall, tmp_path / "a.rff", minutes=0.02).run()
     assert load_field(tmp_path / "a.rff").metadata.held_out_psnr_db is not None
+
+
+@pytest.mark.parametrize("finishing_s", [5.0, 20.0, 1000.0])
+def test_finishing_is_left_the_time_that_it_takes_here_and_now(
+    wall, tmp_path, monkeypatch, finishing_s
+):
+    """Of one minute, half at most; and it is said that the run will end late."""
+    monkeypatch.setattr(run, "finishing_s", lambda *_: finishing_s)
+    monkeypatch.setattr(run, "monotonic", lambda: 104.0)
+    job = verb(wall, tmp_path / "a.rff", minutes=1.0, plain=False).training_job()
+    console = Console(record=True, file=io.StringIO(), width=200)
+    limits = run._leaving_time_to_finish(job, run._trainer(job), 100.0, console)
+    assert limits.kept_s == {5.0: 15.0, 20.0: 23.0, 1000.0: 28.0}[finishing_s]
+    assert ("will end about 16 min late" in console.export_text()) == (finishing_s == 1000.0)
+
+
+def test_finishing_is_timed_by_parts_of_it(wall, tmp_path):
+    job = verb(wall, tmp_path / "a.rff").training_job()
+    field, seen = run._trainer(job).field(), job.held_out.pictures
+    assert 0 < finishing_s(field, job.dataset.pictures, seen, threads=1) < 60
+
+
+@pytest.fixture
+def nowhere(tmp_path):
+    """Black points that no camera sees."""
+    points = SourcePoints(np.full((50, 3), 900.0), np.zeros((50, 3), np.uint8))
+    write_points(tmp_path / "nowhere.ply", points)
+    return tmp_path / "nowhere.ply"
+
+
+@pytest.mark.parametrize("holdout", [4, None])
+def test_a_field_of_no_use_is_written_and_the_run_fails(wall, tmp_path, nowhere, holdout):
+    out = tmp_path / "a.rff"
+    with pytest.raises(RfedgeError, match=r"dB .* after 80 iterations, no better .*field check"):
+        verb(wall, out, iterations=80, points=nowhere, holdout=holdout).run()
+    assert load_field(out).primitives
+
+
+def test_a_few_iterations_that_were_asked_for_are_no_failure(wall, tmp_path, nowhere, capsys):
+    verb(wall, tmp_path / "a.rff", iterations=3, points=nowhere).run()
+    assert re.search(
+        r"after 3 iterations, no\s+better[^ß]*these\s+are\s+few[^ß]*--iterations",
+        capsys.readouterr().out,
+    )
+
+
+def test_a_run_ends_with_its_quality_and_iterations(wall, tmp_path, capsys):
+    verb(wall, tmp_path / "a.rff").run()
+    held_out_db = load_field(tmp_path / "a.rff").metadata.held_out_psnr_db
+    *_, last = capsys.readouterr().out.strip().splitlines()
+    assert last.strip() == f"{held_out_db:.2f} dB held out after 200 iterations"
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,13 @@ def test_minutes_are_those_of_the_whole_run():
     assert (told[0].left_s, told[-1].left_s) == pytest.approx((118.0, 15.0), abs=2.0)
 
 
+def test_what_came_before_the_loop_counts():
+    steps = Steps(1_000_000)
+    limits = LoopLimits(minutes=1.0, measurements=0)
+    statuses(TrainingLoop(steps, limits, None, lambda: steps.now_s, begun_s=20.0))
+    assert steps.iteration == 20
+
+
 def test_the_curve_has_so_many_points_and_ends_at_the_end():
     steps = Steps(24)
     loop = loop_of(steps, LoopLimits(measurements=4))
