@@ -76,6 +76,8 @@ def session(data: bytes) -> None:
             machine.receive(read if isinstance(read, Hello) else reader.read(read), float(now))
         except (InvalidInput, FrameRefused) as error:
             machine.refuse(error, float(now))
+        for ahead in machine.poses_to_prepare():
+            machine.prepared(ahead)
         for job in machine.jobs_to_start(float(now)):
             if isinstance(job, OpenJob):
                 machine.opened(job, float(now))

@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Iterator
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,7 +24,14 @@ from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.head import FrameReader, FrameRefused
-from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract, StageTimes
+from rfcore.wire.messages import (
+    CameraDescription,
+    Frame,
+    Hello,
+    PoseAhead,
+    RendererContract,
+    StageTimes,
+)
 
 FIELD = "ab" * 32
 INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
@@ -35,6 +43,7 @@ HELLO = Hello(
     RendererContract(RENDERER_CONTRACT, exact=True),
 )
 
+WON = StageTimes(ahead_ns=10_000_000)
 faults = st.sampled_from(["deliver", "lose", "repeat", "delay", "flip", "cut", "answer lost"])
 
 
@@ -48,6 +57,7 @@ class World:
         self.results: list[FrameResult] = []
         self.delayed: list[bytes] = []
         self.encoder = (-1, 0)
+        self.prepared = 0
         self.connect()
 
     def connect(self) -> None:
@@ -69,7 +79,12 @@ class World:
             self.agent.connection_lost(self.agent.broken, self.now)
             self.connect()
         while (job := self.agent.job_to_start(0.0)) is not None:
-            self.agent.encoded(self.encode(job), self.now)
+            encoded, capture = self.encode(job), job.capture
+            address = ("front", encoded.packet.epoch, encoded.packet.sequence)
+            ahead = PoseAhead(*address, capture.capture_time_ns, encoded.pose)
+            self.agent.located(job, ahead)
+            self.exchange()
+            self.agent.encoded(encoded, self.now)
             self.exchange()
         self.results += self.agent.take_results()
 
@@ -83,7 +98,7 @@ class World:
 
     def exchange(self) -> None:
         for outgoing in self.agent.messages_to_send(self.now):
-            is_frame = isinstance(outgoing.message, Frame)
+            is_frame = isinstance(outgoing.message, (Frame, PoseAhead))
             fault = next(self.plan, "deliver") if is_frame else "deliver"
             for arrived in self.through(outgoing.data, fault):
                 self.serve(arrived)
@@ -110,14 +125,22 @@ class World:
 
     def serve(self, data: bytes) -> None:
         try:
+            is_ahead = False
             message = client_message_from_bytes(data)
             if isinstance(message, Hello):
                 self.reader = FrameReader(message)
             else:
+                is_ahead = message.is_ahead
                 message = self.reader.read(message)
             self.server.receive(message, self.now)
         except (InvalidInput, FrameRefused) as error:
-            self.server.refuse(error, self.now)
+            if is_ahead:
+                self.server.refuse_ahead()
+            else:
+                self.server.refuse(error, self.now)
+        for prepared in self.server.poses_to_prepare():
+            self.prepared += 1
+            self.server.prepared(prepared)
         while jobs := self.server.jobs_to_start(self.now):
             for job in jobs:
                 self.work(job)
@@ -129,7 +152,7 @@ class World:
         packet = job.frame.packet
         assert (packet.epoch, packet.sequence) > self.decoded, "handed out in order"
         self.decoded = (packet.epoch, packet.sequence)
-        self.server.decoded(job, packet.reconstruction_digest, StageTimes(), self.now)
+        self.server.decoded(job, packet.reconstruction_digest, WON, self.now)
 
 
 @settings(max_examples=300)
@@ -156,12 +179,15 @@ def test_without_faults_every_picture_is_acknowledged_in_one_epoch() -> None:
         world.step(index)
     assert [result.outcome for result in world.results] == [Outcome.ACKED] * 20
     assert {result.packet.epoch for result in world.results if result.packet} == {0}
+    assert world.prepared == 20
 
 
-def test_a_damaged_frame_costs_one_picture() -> None:
-    world = World(["deliver", "deliver", "flip"])
+@pytest.mark.parametrize("fault", ["flip", "cut"])
+@pytest.mark.parametrize("before", [4, 5], ids=["pose", "frame"])
+def test_a_damaged_pose_or_frame_costs_one_picture(fault: str, before: int) -> None:
+    world = World(["deliver"] * before + [fault])
     for index in range(8):
         world.step(index)
     outcomes = [str(result.outcome) for result in world.results]
-    assert outcomes.count("nacked") == 1
+    assert outcomes.count("nacked") + outcomes.count("lost") == 1
     assert outcomes.count("acked") == 7

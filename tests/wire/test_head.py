@@ -335,6 +335,30 @@ def test_a_pose_ahead_whose_frame_never_comes_gives_way_to_the_next(hello, frame
     assert reader.frame(writer.data(alone, frames[0].address)) == alone
 
 
+def test_one_lost_frame_among_poses_ahead_costs_one_packet(hello, frame):
+    """The pose that names the lost frame is refused, so is its frame; the next names another."""
+    frames = chain(frame, 5)
+    sent, reader = sent_ahead(hello, frames), FrameReader(hello)
+    for ahead, data in sent[:2]:
+        reader.ahead(ahead)
+        reader.frame(data)
+    reader.ahead(sent[2][0])  # its frame is lost
+    for read, data in ((reader.ahead, sent[3][0]), (reader.frame, sent[3][1])):
+        with pytest.raises(FrameRefused) as caught:
+            read(data)
+        assert caught.value.reason is RejectReason.UNKNOWN_STATE
+        assert caught.value.address == frames[3].address
+    base = frames[1].packet.reconstruction_digest
+    again = replace(frames[4].packet, epoch=4, sequence=0, base_digest=base)
+    healed = replace(frames[4], packet=again)
+    writer = FrameWriter(hello)
+    for one, before in zip(frames[:2], [None, frames[0]], strict=True):
+        writer.data(one, before and before.address)
+    message = writer.ahead(healed.ahead, frames[1].address)
+    reader.ahead(pb.StreamRequest.FromString(message).pose_ahead)
+    assert reader.frame(writer.data(healed, frames[1].address)) == healed
+
+
 def test_every_single_flip_of_a_pose_ahead_is_refused(hello, frame):
     sent = sent_ahead(hello, chain(frame, 3))
     ahead = sent[2][0]
