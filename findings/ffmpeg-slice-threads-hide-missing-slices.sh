@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# FFmpeg 8, libavcodec 62.28 (PyAV 18.1.0): a picture that lacks slices is flagged as corrupt with one thread, and passes
-# as whole with threads by slice, the usual advice for a decoder of low delay (threads by frame delay
-# each picture). With slice threads libavcodec's error resilience is off by default, and the flag goes
-# with it. Pictures predicted from the damaged one are flagged in neither case.
-# Seen: 1 thread: 1 of 20 flagged, 13 differ from the sent ones; slice threads: 0 flagged, 13 differ.
+# FFmpeg 8, libavcodec 62.28 (PyAV 18.1.0): a picture that lacks slices is flagged as corrupt with one
+# thread, and passes as whole with threads by slice, the usual advice for a decoder of low delay
+# (threads by frame delay each picture). With slice threads libavcodec's error resilience is off by
+# default, and the flag goes with it. Pictures predicted from the damaged one are flagged in neither.
+# Seen: one thread: 1 of 20 flagged, 13 differ from the sent ones; slice threads: 0 flagged, 13 differ.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

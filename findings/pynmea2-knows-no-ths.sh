@@ -19,7 +19,7 @@ def sentence(body):
     return f"${body}*{check:02X}"
 
 
-assert pynmea2.parse(sentence("GNHDT,77.5,T"), check=True).heading == "77.5"
+assert float(pynmea2.parse(sentence("GNHDT,77.5,T"), check=True).heading) == 77.5
 try:
     pynmea2.parse(sentence("GNTHS,77.5,A"), check=True)
 except pynmea2.SentenceTypeError as error:
