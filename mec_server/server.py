@@ -11,7 +11,7 @@ import socket
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -150,6 +150,7 @@ class EdgeServer:
         self._metrics = ServerMetrics(self.registry, per_vehicle=config.metrics.per_vehicle)
         self._metrics_endpoint: MetricsEndpoint | None = None
         self._log_limiter = LogLimiter()
+        self._hurried = asyncio.Event()
         self._following: list[asyncio.Task[None]] = []
         self._nats: NatsServices | None = None
         self._make_workers()
@@ -379,12 +380,17 @@ class EdgeServer:
             )
         return self.address
 
+    def hurry(self) -> None:
+        """End the hold of ``stop`` now."""
+        self._hurried.set()
+
     async def stop(self) -> None:
         """Let vehicles move if ``drain_hold_s`` is set; then finish the frames taken, and close."""
         log.info("draining", hold_s=self._config.drain_hold_s, within_s=self._config.drain_s)
         await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
         if self._config.drain_hold_s:
-            await asyncio.sleep(self._config.drain_hold_s)  # for health checks to notice
+            with suppress(TimeoutError):  # for health checks to notice
+                await asyncio.wait_for(self._hurried.wait(), self._config.drain_hold_s)
             left = await self._edge.send_away(self._config.drain_s)
             log.info("vehicles sent away", streams_left=left)
         await self._release(self._config.drain_s)
@@ -533,11 +539,17 @@ class EdgeServer:
 
 
 async def serve(config: ServerConfig, opened: OpenCameras = open_cameras) -> None:
-    """Serve until SIGTERM or SIGINT, then drain."""
+    """Serve until SIGTERM or SIGINT, then drain; a second signal ends the hold."""
     server = EdgeServer(config, opened)
     stopped = asyncio.Event()
+
+    def stop() -> None:
+        if stopped.is_set():
+            server.hurry()
+        stopped.set()
+
     for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+        asyncio.get_running_loop().add_signal_handler(number, stop)
     with waiting(f"fields of {config.fields} to be opened", log_wait):
         await server.start()
     gc.collect()

@@ -84,3 +84,9 @@ async def test_while_a_server_drains_it_serves_who_is_there_and_lets_nobody_in(
             assert isinstance(await vehicle.ask(coded.frames[0]), Ack)
             assert await vehicle.farewell() is grpc.StatusCode.OK
             await stopping
+
+
+async def test_who_is_in_a_hurry_ends_the_hold(serve: Any) -> None:
+    async with asyncio.timeout(10), AsyncExitStack() as running:
+        server = await running.enter_async_context(serve(drain_hold_s=600.0))
+        server.hurry()
