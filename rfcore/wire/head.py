@@ -58,6 +58,7 @@ Bytes of each part, by ``lab/results/head.md`` where usual; at worst of a frame 
 | check | 4 | 4 |
 | digests | 8 | 8 |
 | block means, between inexact renderers alone | 0 | 64 |
+| with the pose ahead: its message, and what is left of the head | 14 and 19 | 59 and 19 |
 
 *What the checks must catch.* The check is CRC-32 (zlib) of Hello's message, then of every value,
 stated, implied or sent ahead, big-endian: camera (1 byte), epoch (4), sequence, microseconds (8
