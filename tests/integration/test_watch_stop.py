@@ -6,9 +6,10 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +209,43 @@ def test_an_error_of_the_watch_is_raised_where_it_was_called(
     monkeypatch.setattr(twin_client, "CONNECT_S", 0.05)
     with pytest.raises(RfedgeError, match="no server at"):
         watch_until_stopped(WatchSettings(), TwinClient(NOWHERE))
+
+
+class OnePicture:
+    """A source of one picture of 345,600 bytes, for which the vehicle sent 4,200."""
+
+    def watch(
+        self,
+        subscription: Any,
+        connected: Callable[[str], None],
+        problem: Callable[[str], None],
+    ) -> Generator[TwinPicture, None, None]:
+        del subscription
+        problem("refused")
+        connected("")
+        yield replace(grey(1), picture=bytes(345_600), payload_bytes=4_200)
+
+    def stop(self) -> None:
+        """Nothing is to be ended."""
+
+
+def test_a_watcher_prints_what_was_sent_and_waits_for_a_picture_once_it_is_connected(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waited: list[str] = []
+
+    @contextmanager
+    def waiting(what: str, say: Any) -> Iterator[Callable[[str], None]]:
+        del say
+        waited.append(what)
+        yield waited.append
+
+    monkeypatch.setattr(module, "waiting", waiting)
+    module.watch(WatchSettings(), OnePicture())
+    assert waited == ["a connection", "a picture", "another picture"]
+    out = capsys.readouterr().out
+    assert "4200 bytes" in out
+    assert "345600" not in out
 
 
 @contextmanager
