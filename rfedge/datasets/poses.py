@@ -44,6 +44,9 @@ Tell = Callable[[str], None]
 MIN_PICTURES = 3
 ANY_FORWARD_MOTION = 1.0
 """A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
+START_ANGLES_DEG = (16.0, 2.0)
+"""Angles that points of the first pair are to be seen under, tried one after the other: COLMAP's
+default, which it lowers to 4 by itself, and that of a short drive on which all pictures overlap."""
 
 
 def pose_dataset(
@@ -181,15 +184,18 @@ def _alone(
     options = _options(settings)
     options.ba_refine_focal_length = options.ba_refine_extra_params = not settings.parameters
     options.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
-    models = cancellable(
-        pycolmap.incremental_mapping,
-        root / DATABASE,
-        root,
-        folder,
-        options,
-        initial_image_pair_callback=lambda: placing.start_from(2),
-        next_image_callback=placing.one_more,
-    )
+    models: dict[int, pycolmap.Reconstruction] = {}
+    for angle_deg in START_ANGLES_DEG:
+        options.mapper.init_min_tri_angle = angle_deg
+        models = models or cancellable(
+            pycolmap.incremental_mapping,
+            root / DATABASE,
+            root,
+            folder,
+            options,
+            initial_image_pair_callback=lambda: placing.start_from(2),
+            next_image_callback=placing.one_more,
+        )
     if not models:
         raise DatasetError("no two pictures share enough to start from; take them closer together")
     return max(models.values(), key=lambda model: model.num_reg_images())
