@@ -69,7 +69,7 @@ def line(shot: Shot, reason: str) -> dict[str, Any]:
     latency_ms = None if shot.latency_s is None else 1e3 * shot.latency_s
     result = "lost" if shot.end is End.OPEN else str(shot.end)
     return {
-        "capture_time_ns": wall_ns(shot.due_s),
+        "capture_time_ns": wall_ns(shot.due_s) // 1000 * 1000,  # as frames have it
         "result": result,
         "latency_ms": latency_ms,
         "exact": shot.is_exact,

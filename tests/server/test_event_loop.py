@@ -139,6 +139,34 @@ async def test_what_was_returned_or_raised_reaches_the_loop_that_asked(
     assert [type(o) for o in outcomes if isinstance(o, Exception)] == [ZeroDivisionError]
 
 
+async def test_there_is_room_while_a_thread_is_free_and_nothing_waits(
+    make_workers: MakeWorkers,
+) -> None:
+    workers, begun, go_on = make_workers(2), threading.Semaphore(0), threading.Event()
+
+    def work() -> None:
+        begun.release()
+        go_on.wait(30)
+
+    room, results = [workers.has_room], []
+    for _ in range(3):
+        results.append(asyncio.create_task(result_of(workers, work)))
+        await asyncio.sleep(0)
+        if len(results) < 3:
+            assert await asyncio.to_thread(begun.acquire, timeout=30)
+        room.append(workers.has_room)
+    assert room == [True, True, False, False]
+    go_on.set()
+    await asyncio.gather(*results)
+    await result_of(workers, go_on.set)
+    assert await asyncio.to_thread(_soon, lambda: workers.has_room)
+
+
+def _soon(holds: Callable[[], bool]) -> bool:
+    """Wait for something that follows within moments."""
+    return any(holds() or threading.Event().wait(0.01) for _ in range(3000))
+
+
 async def test_every_thread_of_all_workers_begins_at_the_same_time(
     make_workers: MakeWorkers,
 ) -> None:
