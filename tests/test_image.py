@@ -24,7 +24,7 @@ def test_a_png_comes_back_byte_for_byte(size, tmp_path):
 def test_a_picture_beyond_the_budget_is_refused_before_it_is_decoded(tmp_path, monkeypatch):
     write_png(tmp_path / "a.png", noise(64, 48))
     monkeypatch.setattr("rfcore.image.MAX_PICTURE_PX", 64 * 48 - 1)
-    monkeypatch.setattr("rfcore.image.EXACT_CONVERSION", None)  # none is to get so far
+    monkeypatch.setattr("rfcore.image.pixels_of", None)  # none is to get so far
     with pytest.raises(DatasetError, match=r"a\.png: 48x64 px is above 3071 pixels; scale it"):
         read_rgb(tmp_path / "a.png")
 

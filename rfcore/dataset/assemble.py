@@ -123,9 +123,9 @@ class Dataset:
 
     ``rate_hz`` is the mean rate of the pictures' times, ``None`` unless every picture has one and
     they increase. ``points`` is ``None`` when the dataset has none. ``changed`` has the names of
-    pictures by what reading does to them. ``sorted_out`` counts those that are listed but were
-    deleted as blurred (``rfcore.dataset.read``). ``exposure_varies``
-    is true where the dataset says that every picture has an exposure of its own. ``anchor`` says
+    pictures by what reading does to them, ``notes`` what was chosen, a line each. ``sorted_out``
+    counts those that are listed but were deleted as blurred (``rfcore.dataset.read``).
+    ``exposure_varies`` is true where the dataset says that every picture has an exposure of its own. ``anchor`` says
     where on the Earth the tile's axes are, if the dataset does.
     """
 
@@ -134,16 +134,19 @@ class Dataset:
     points: PointCloud | None
     tile_origin: TileOrigin
     changed: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
     sorted_out: int = 0
     exposure_varies: bool = False
     anchor: Anchor | None = None
 
     @property
     def changes(self) -> tuple[str, ...]:
-        """Lines that say what reading does to the pictures: it undistorts or crops them."""
+        """Lines that say what was chosen, and what reading does to the pictures, with their
+        number."""
         names = [picture.name for picture in self.pictures]
         counts = {what: sum(map(those.__contains__, names)) for what, those in self.changed.items()}
-        return tuple(f"{n} of {len(names)} pictures are {what}" for what, n in counts.items() if n)
+        counted = (f"{n} of {len(names)} pictures {what}" for what, n in counts.items() if n)
+        return (*self.notes, *counted)
 
 
 def assemble(source: Source, options: ReadOptions) -> Dataset:
@@ -164,6 +167,7 @@ def assemble(source: Source, options: ReadOptions) -> Dataset:
         points=localised(source.points, origin) if source.points is not None else None,
         tile_origin=origin,
         changed=_changed(source.pictures, options.size_px),
+        notes=source.notes,
         sorted_out=source.sorted_out,
         exposure_varies=source.exposure_varies,
         anchor=source.anchor.relative_to(origin) if source.anchor is not None else None,
@@ -198,8 +202,13 @@ def _read(picture: SourcePicture, size_px: tuple[int, int] | None = None) -> Rgb
 def _changed(
     pictures: Sequence[SourcePicture], size_px: tuple[int, int] | None
 ) -> dict[str, frozenset[str]]:
-    """Return the names of pictures that are undistorted, and of those of each cropped shape."""
-    changed = {"undistorted": [p.name for p in pictures if p.camera.lens is not None]}
+    """Return the names of pictures by what is done to them, after "N pictures"."""
+    changed: dict[str, list[str]] = {}
+    for picture in pictures:
+        for note in picture.notes:
+            changed.setdefault(note, []).append(picture.name)
+        if picture.camera.lens is not None:
+            changed.setdefault("are undistorted", []).append(picture.name)
     for picture in pictures:
         if size_px is None:
             break
@@ -208,7 +217,7 @@ def _changed(
         if tuple(part) != from_px:
             shapes = [f"{width}x{height}" for width, height in (from_px, part, size_px)]
             what = (
-                f"cropped from {shapes[0]} to {shapes[1]} px, "
+                f"are cropped from {shapes[0]} to {shapes[1]} px, "
                 f"{part[0] * part[1] / (from_px[0] * from_px[1]):.0%} of them, which has the "
                 f"shape of {shapes[2]}"
             )

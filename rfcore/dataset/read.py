@@ -62,6 +62,7 @@ from rfcore.dataset.picture_file import (
 from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
 from rfcore.dataset.recording import read_recording_source
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
+from rfcore.dataset.video import is_video
 from rfcore.errors import DatasetError
 from rfcore.tables import Range, Table
 
@@ -241,8 +242,6 @@ def _inria_camera(where: str, keys: Table) -> SourceCamera:
         return SourceCamera(Intrinsics(width_px, height_px, *focal_px, width_px / 2, height_px / 2))
 
 
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
-
 EXPECTED = (
     "transforms.json, sparse/0 of COLMAP, calib.txt or oxts of KITTI, cameras.json of INRIA, "
     "camera.toml, recording.jsonl of a server"
@@ -280,7 +279,6 @@ def read_source(path: Path) -> Source:
         return read_kitti_raw_source(path.parent) if path.name == OXTS else _read_folder(path)
     if not path.exists():
         raise DatasetError(f"{path}: cannot be read (it does not exist)")
-    refuse_video(path)
     if path.suffix == ".toml":
         return read_recording_source(path)
     if path.name == RECORDING_NAME:
@@ -290,13 +288,9 @@ def read_source(path: Path) -> Source:
     if path.suffix in (".bin", ".txt"):
         return read_colmap_source(path.parent)
     if path.suffix != ".json":
+        refuse_video(path)
         raise DatasetError(f"{path}: is no file that describes a dataset ({EXPECTED})")
     return read_inria_source(path) if path.name == "cameras.json" else read_transforms_source(path)
-
-
-def is_video(path: Path) -> bool:
-    """Tell whether a file is a video, by its name."""
-    return path.suffix.lower() in VIDEOS and not path.is_dir()
 
 
 def refuse_video(path: Path) -> None:

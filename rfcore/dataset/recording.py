@@ -30,23 +30,17 @@
 The camera has OpenCV axes. A video's time starts at 0 with its first frame, a folder's with the
 first picture (``rate_hz``) or where ``times`` says.
 
-``Video`` reads the frames of a file by their number, with the times that the container states,
-counted from the first one. A frame that does not state its colour matrix is taken as BT.709
-from 720 lines up and as BT.601 below, as players do. A display rotation, which phones write, is
-refused, since intrinsics would belong to the other orientation.
+A video that phones mark as turned by 90 degrees is turned. ``width_px`` and ``height_px`` say
+whether the camera is that of the frames as shown, or as stored: then it is turned with them. A
+video that is turned by 180 degrees or mirrored is taken as shown.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from threading import Lock
-
-import av
-from av.error import FFmpegError
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import (
@@ -62,84 +56,10 @@ from rfcore.dataset.keys import (
 from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
+from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError
-from rfcore.image import Rgb, rgb_from_video_frame
+from rfcore.image import Rgb
 from rfcore.tables import Range, Table
-
-
-class Video:
-    """A video file; frames are decoded when read, cheaply when they are read in order.
-
-    Raises ``DatasetError``, naming the file, when it cannot be decoded or is of another size than
-    the camera's.
-    """
-
-    def __init__(self, file: Path, intrinsics: Intrinsics) -> None:
-        self.file = file
-        self._lock = Lock()
-        try:
-            self._container = av.open(str(file))
-            self._stream = self._container.streams.video[0]
-            self._pts = self._presentation_times()
-            if not self._pts:
-                raise DatasetError(f"{file}: holds no frames")
-            self._check_size(intrinsics)
-        except (FFmpegError, OSError, IndexError, StopIteration) as error:
-            raise DatasetError(f"{file}: not a readable video ({error})") from error
-        self._frames = self._container.decode(self._stream)
-        self._next = -1
-
-    @property
-    def times_ns(self) -> tuple[int, ...]:
-        """Times at which the frames are shown, counted from the first one."""
-        tick_s = self._stream.time_base or Fraction(1, 90_000)
-        return tuple(round((pts - self._pts[0]) * tick_s * 1_000_000_000) for pts in self._pts)
-
-    def read(self, index: int) -> Rgb:
-        """Return frame ``index`` as uint8 [H, W, 3]."""
-        with self._lock:
-            try:
-                return rgb_from_video_frame(self._frame(index))
-            except (FFmpegError, StopIteration) as error:
-                raise DatasetError(
-                    f"{self.file}: frame {index} cannot be decoded ({error})"
-                ) from error
-
-    def _frame(self, index: int) -> av.VideoFrame:
-        """Decode on to a frame, from the key frame before it unless it is the next one."""
-        wanted = self._pts[index]
-        if index != self._next:
-            self._container.seek(wanted, stream=self._stream)
-            self._frames = self._container.decode(self._stream)
-        frame = next(self._frames)
-        while frame.pts is None or frame.pts < wanted:
-            frame = next(self._frames)
-        if frame.pts != wanted:
-            raise DatasetError(f"{self.file}: seeking to frame {index} ends at another frame")
-        self._next = index + 1
-        return frame
-
-    def _presentation_times(self) -> list[int]:
-        """Every frame's time in the stream's ticks, without decoding."""
-        packets = self._container.demux(self._stream)
-        return sorted({packet.pts for packet in packets if packet.pts is not None and packet.size})
-
-    def _check_size(self, intrinsics: Intrinsics) -> None:
-        if self._stream.codec_context is None:
-            raise DatasetError(f"{self.file}: is of a codec that is not known")
-        found = (self._stream.codec_context.width, self._stream.codec_context.height)
-        if found != (intrinsics.width_px, intrinsics.height_px):
-            raise DatasetError(
-                f"{self.file}: video is {found[0]}x{found[1]} px, its camera says "
-                f"{intrinsics.width_px}x{intrinsics.height_px}"
-            )
-        self._container.seek(self._pts[0], stream=self._stream)
-        first = next(self._container.decode(self._stream), None)
-        if first is None or first.rotation:
-            turned = "nothing" if first is None else f"frames to be turned by {first.rotation}"
-            raise DatasetError(f"{self.file}: holds {turned} degrees; encode it upright first")
-        self._container.seek(self._pts[0], stream=self._stream)
-
 
 SECTIONS = {
     "camera": "model width_px height_px fx_px fy_px cx_px cy_px k1 k2 k3 k4 p1 p2",
@@ -211,28 +131,41 @@ class TimedPicture:
     read: Callable[[], Rgb]
 
 
+@dataclass(frozen=True)
+class TimedPictures:
+    """The pictures of a recording and their camera.
+
+    ``turn`` is composed after the trajectory's poses. ``notes`` says in a line each what is done.
+    """
+
+    pictures: Sequence[TimedPicture]
+    camera: SourceCamera
+    turn: Pose
+    notes: tuple[str, ...] = ()
+
+
 def read_recording_source(file: Path) -> Source:
     """Read a ``camera.toml`` and what it names. Raises ``DatasetError`` naming the file and key."""
     content = _load(file)
     where = f"{file}: [camera]"
     camera = _camera(where, content["camera"])
-    timed = _timed_pictures(file, content["pictures"], camera.intrinsics)
+    timed = _timed_pictures(file, content["pictures"], camera)
     poses = RecordedPoses.of(file, content["trajectory"])
     pictures = tuple(
         SourcePicture(
             where=f"{file}: {picture.name}",
             name=picture.name,
-            camera=camera,
-            world_from_cam=poses.at(f"{file}: {picture.name}", picture.time_ns),
+            camera=timed.camera,
+            world_from_cam=poses.at(f"{file}: {picture.name}", picture.time_ns).compose(timed.turn),
             read=picture.read,
             time_ns=picture.time_ns + poses.offset_ns,
         )
-        for picture in timed
+        for picture in timed.pictures
         if poses.wanted(picture.time_ns)
     )
-    dropped = len(timed) - len(pictures)
+    dropped = len(timed.pictures) - len(pictures)
     anchor = anchor_at(str(file), content["anchor"].values if "anchor" in content else None)
-    return Source(file, pictures, _points(file, content), dropped, anchor=anchor)
+    return Source(file, pictures, _points(file, content), dropped, anchor=anchor, notes=timed.notes)
 
 
 def read_recording_camera(file: Path) -> RecordingCamera:
@@ -278,40 +211,49 @@ def _camera(where: str, keys: Table) -> SourceCamera:
     return SourceCamera(intrinsics, lens_of(where, keys.value("model", "PINHOLE"), keys))
 
 
-def _timed_pictures(file: Path, keys: Table, intrinsics: Intrinsics) -> Sequence[TimedPicture]:
+def _timed_pictures(file: Path, keys: Table, camera: SourceCamera) -> TimedPictures:
     where = f"{file}: [pictures]"
     if ("video" in keys) == ("folder" in keys):
         raise DatasetError(f"{where}: name either a 'video' or a 'folder'")
     every = keys.whole("every", Range(1), 1)
     timed = _video_pictures if "video" in keys else _folder_pictures
-    return timed(where, file.parent, keys, intrinsics)[::every]
+    found = timed(where, file.parent, keys, camera)
+    return replace(found, pictures=found.pictures[::every])
 
 
-def _video_pictures(
-    where: str, folder: Path, keys: Table, intrinsics: Intrinsics
-) -> list[TimedPicture]:
-    video = Video(inside(where, folder, keys.text("video")), intrinsics)
-    stem = video.file.stem
-    return [
-        TimedPicture(f"{stem}_{i:06d}", time, partial(video.read, i))
-        for i, time in enumerate(video.times_ns)
+def _video_pictures(where: str, folder: Path, keys: Table, camera: SourceCamera) -> TimedPictures:
+    video = Video(inside(where, folder, keys.text("video")))
+    index, k = video.index, camera.intrinsics
+    stated_px, turn = (k.width_px, k.height_px), Pose.identity()
+    notes = [f"{video.file.name}: {note}" for note in index.notes]
+    if stated_px != video.size_px and stated_px == index.size_px:
+        turn, camera = index.orientation.stored_from_shown, index.orientation.camera(camera)
+        notes.append(f"{video.file.name}: its camera is turned with it")
+    elif stated_px != video.size_px:
+        raise DatasetError(
+            f"{video.file}: video is {video.size_px[0]}x{video.size_px[1]} px, its camera says "
+            f"{k.width_px}x{k.height_px}"
+        )
+    pictures = [
+        TimedPicture(f"{video.file.stem}_{i:06d}", time, partial(video.read, i))
+        for i, time in enumerate(index.times_ns)
     ]
+    return TimedPictures(pictures, camera, turn, tuple(notes))
 
 
-def _folder_pictures(
-    where: str, folder: Path, keys: Table, intrinsics: Intrinsics
-) -> list[TimedPicture]:
+def _folder_pictures(where: str, folder: Path, keys: Table, camera: SourceCamera) -> TimedPictures:
     pictures = inside(where, folder, keys.text("folder"))
     paths = sorted(path for path in pictures.glob("*") if path.suffix in SUFFIXES)
     if not paths:
         raise DatasetError(f"{where}: folder {pictures} holds no pictures ({', '.join(SUFFIXES)})")
     times_ns = _folder_times_ns(where, folder, keys, len(paths))
     for path in paths:
-        check_size(path, intrinsics)
-    return [
-        TimedPicture(path.name, time, partial(read_picture, path, intrinsics))
+        check_size(path, camera.intrinsics)
+    timed = [
+        TimedPicture(path.name, time, partial(read_picture, path, camera.intrinsics))
         for path, time in zip(paths, times_ns, strict=True)
     ]
+    return TimedPictures(timed, camera, Pose.identity())
 
 
 def _folder_times_ns(where: str, folder: Path, keys: Table, count: int) -> list[int]:

@@ -66,7 +66,8 @@ class Source:
     ``file`` is the one that describes it. ``sorted_out`` counts pictures that are listed but were
     deleted on purpose, by the rules of the format. ``exposure_varies`` is true where the dataset
     says that the camera chose exposure or white balance anew for each picture. ``anchor`` says
-    where on the Earth its world is, if the dataset does.
+    where on the Earth its world is, if the dataset does. ``notes`` says in a line each what the
+    reader chose or left out.
     """
 
     file: Path
@@ -75,6 +76,7 @@ class Source:
     sorted_out: int = 0
     exposure_varies: bool = False
     anchor: Anchor | None = None
+    notes: tuple[str, ...] = ()
 
 
 def read_points(path: Path) -> SourcePoints:

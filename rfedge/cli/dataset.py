@@ -118,7 +118,7 @@ class DatasetPoses:
         import shutil
         import signal
 
-        from rfcore.dataset.read import is_video
+        from rfcore.dataset.video import is_video
 
         field = self._field()
         if field is None:
@@ -174,7 +174,7 @@ class DatasetPoses:
     def _among_pictures(self, images: Path) -> None:
         from rich.console import Console
 
-        from rfcore.dataset.read import is_video
+        from rfcore.dataset.video import is_video
         from rfedge.datasets.colmap_features import PoseSettings
         from rfedge.datasets.poses import pose_dataset
 

@@ -10,19 +10,17 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
-from av.container import InputContainer
-from av.error import FFmpegError
-from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from rfcore.dataset.trajectory import NS_PER_S
+from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.files import write_whole
-from rfcore.image import rgb_from_video_frame, write_png
+from rfcore.image import write_png
 
 MAX_PER_SECOND = 100.0
 ABOUT = "video.json"
@@ -57,18 +55,18 @@ def sharpest_frames(
     if not 0 < per_second <= MAX_PER_SECOND:
         raise InvalidInput("per-second", f"{per_second:g} is outside 0..{MAX_PER_SECOND:g}")
     try:
-        _claim(folder, FrameSelection(video.name, video.stat().st_size, per_second))
-        done = _first_missing(folder)
-        with av.open(str(video)) as container:
-            stream = container.streams.video[0]
-            total_s = _duration_s(stream)
-            frames = _frames(container, stream, done / per_second)
-            for stretch in _stretches(frames, per_second):
-                if stretch.number >= done:
-                    write_png(_path(folder, stretch.number), rgb_from_video_frame(stretch.frame))
-                    tell(f"sharpest frames: {stretch.number / per_second:.0f} of {total_s:.0f} s")
-    except (FFmpegError, OSError, IndexError) as error:
-        raise DatasetError(f"{video}: not a readable video ({error})") from error
+        size_bytes = video.stat().st_size
+    except OSError as error:
+        raise DatasetError(f"{video}: cannot be read ({error.strerror})") from error
+    opened = Video(video)
+    _claim(folder, FrameSelection(video.name, size_bytes, per_second))
+    for note in opened.index.notes:
+        tell(note)
+    done = _first_missing(folder)
+    total_s = opened.index.times_ns[-1] / NS_PER_S
+    for stretch in _stretches(opened, done, per_second):
+        write_png(_path(folder, stretch.number), opened.shown(stretch.frame))
+        tell(f"sharpest frames: {stretch.number / per_second:.0f} of {total_s:.0f} s")
     return sum(1 for _ in folder.glob("*.png"))
 
 
@@ -102,37 +100,14 @@ def _path(folder: Path, number: int) -> Path:
     return folder / f"{number:05}.png"
 
 
-def _duration_s(stream: VideoStream) -> float:
-    if stream.duration is None or stream.time_base is None:
-        return float("nan")
-    return float(stream.duration * stream.time_base)
-
-
-def _frames(
-    container: InputContainer, stream: VideoStream, from_s: float
-) -> Iterator[tuple[float, av.VideoFrame]]:
-    """Yield frames with their time from the start, from the key frame before ``from_s`` on."""
-    tick_s = stream.time_base or Fraction(1, 90_000)
-    start = stream.start_time or 0
-    if from_s > 0:
-        container.seek(start + int(from_s / tick_s), stream=stream)
-    for frame in container.decode(stream):
-        if frame.rotation:
-            raise DatasetError(
-                f"{container.name}: frames are to be turned by {frame.rotation} degrees; encode "
-                "it upright first"
-            )
-        if frame.pts is not None:
-            yield float((frame.pts - start) * tick_s), frame
-
-
-def _stretches(
-    frames: Iterator[tuple[float, av.VideoFrame]], per_second: float
-) -> Iterator[SharpestFrame]:
-    """Yield the sharpest frame of each stretch that has any."""
+def _stretches(video: Video, from_number: int, per_second: float) -> Iterator[SharpestFrame]:
+    """Yield the sharpest frame of each stretch that has any, from stretch ``from_number`` on."""
     best: tuple[float, SharpestFrame] | None = None
-    for time_s, frame in frames:
-        number = int(time_s * per_second + 1e-6)
+    for index, time_ns in enumerate(video.index.times_ns):
+        number = int(time_ns / NS_PER_S * per_second + 1e-6)
+        if number < from_number:
+            continue
+        frame = video.frame(index)
         score = sharpness(_luma(frame))
         if best is not None and number > best[1].number:
             yield best[1]
