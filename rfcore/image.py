@@ -135,8 +135,14 @@ def _half(shape: tuple[int, ...]) -> tuple[int, int]:
     return (height + 1) // 2, (width + 1) // 2
 
 
+PICTURE_FORMATS = ",".join(
+    name for name in av.formats_available if name.endswith("_pipe") or name.startswith("mov,")
+)
+"""Formats of single pictures, AVIF among them."""
 MAX_PICTURE_PX = 1 << 26
 """Most pixels of a picture file: 8192x8192, 200 MB decoded."""
+MAX_PICTURE_BYTES = 8 * MAX_PICTURE_PX + (1 << 20)
+"""Four channels of 16 bits, stored, and metadata."""
 
 
 def read_rgb(path: Path) -> Rgb:
@@ -146,20 +152,31 @@ def read_rgb(path: Path) -> Rgb:
 
 def read_pixels(path: Path) -> Pixels:
     """Read a picture file with what is opaque of it; raise as ``read_rgb``."""
-    return _decode(str(path), str(path))
+    return pixels_of(read_frame(path), str(path))
 
 
 def rgb_from_bytes(data: bytes, source: str) -> Rgb:
     """Return a picture file's content as uint8 [H, W, 3]; raise ``DatasetError`` naming ``source``
     if it cannot be decoded."""
-    return _decode(BytesIO(data), source).rgb
+    return pixels_of(_frame(BytesIO(data), source), source).rgb
 
 
-def _decode(file: str | BytesIO, source: str) -> Pixels:
+def read_frame(path: Path) -> av.VideoFrame:
+    """Return a picture file as it is stored; raise as ``read_rgb``."""
     try:
-        with av.open(file, "r") as container:
+        if path.stat().st_size > MAX_PICTURE_BYTES:
+            raise DatasetError(f"{path}: is above {MAX_PICTURE_BYTES} bytes; save the picture anew")
+        return _frame(BytesIO(path.read_bytes()), str(path))
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _frame(file: BytesIO, source: str) -> av.VideoFrame:
+    """Decode a picture by its content: a name may be a pattern, and a playlist names others."""
+    try:
+        with av.open(file, "r", options={"format_whitelist": PICTURE_FORMATS}) as container:
             _check_pixels(source, container.streams.video[0])
-            return pixels_of(next(container.decode(video=0)), source)
+            return next(container.decode(video=0))
     except (FFmpegError, OSError, StopIteration, IndexError) as error:
         raise DatasetError(f"{source}: not a readable picture ({error})") from error
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 
 Picture = NDArray[Any]
+Mask = NDArray[np.bool_]
 UINT8_PEAK = 255.0
 RADIUS_PX = 5
 SIGMA_PX = 1.5
@@ -65,33 +66,47 @@ def mean_squared_error(a: Picture, b: Picture) -> float:
     return float(np.mean(difference * difference))
 
 
-def psnr(a: Picture, b: Picture, peak: float | None = None) -> float:
+def psnr(a: Picture, b: Picture, peak: float | None = None, mask: Mask | None = None) -> float:
     """Return the PSNR in dB: infinite for identical pictures, by definition.
 
-    ``peak`` is the largest value a sample can have; 255 for uint8. Raises ``InvalidInput`` on
-    pictures that cannot be compared and on a float picture without peak.
+    ``peak`` is the largest value a sample can have; 255 for uint8. With ``mask`` bool [H, W] the
+    mean runs over its pixels alone. Raises ``InvalidInput`` on pictures that cannot be compared, on
+    a float picture without peak and on a mask without pixels.
     """
+    if mask is not None:
+        _check_comparable(a, b)
+        _check_mask(a, mask)
+        a, b = a[mask][None], b[mask][None]
     error = mean_squared_error(a, b)
     top = _resolve_peak(a, peak)
     return math.inf if error == 0.0 else 10.0 * math.log10(top * top / error)
 
 
-def ssim(a: Picture, b: Picture, peak: float | None = None) -> float:
+def ssim(a: Picture, b: Picture, peak: float | None = None, mask: Mask | None = None) -> float:
     """Return the mean SSIM, 1 for identical pictures, at least -1.
 
-    ``peak`` as for ``psnr``. Raises ``InvalidInput`` on pictures that cannot be compared.
+    ``peak`` and ``mask`` as for ``psnr``: pixels outside the mask are taken as equal, and the mean
+    runs over its own. Raises ``InvalidInput`` on pictures that cannot be compared.
     """
     _check_comparable(a, b)
     top = _resolve_peak(a, peak)
     x, y = (np.atleast_3d(picture).astype(np.float64, order="C") for picture in (a, b))
-    channels = range(x.shape[2])
-    return float(
-        np.mean([_ssim_of_plane(x[..., c].copy(), y[..., c].copy(), top) for c in channels])
-    )
+    if mask is not None:
+        _check_mask(a, mask)
+        y = np.where(mask[..., None], y, x)
+    planes = [_ssim_of_plane(x[..., c].copy(), y[..., c].copy(), top) for c in range(x.shape[2])]
+    return float(np.mean(planes if mask is None else [plane[mask] for plane in planes]))
 
 
-def _ssim_of_plane(x: F64, y: F64, peak: float) -> float:
-    """Return the mean SSIM of one channel [H, W]."""
+def _check_mask(picture: Picture, mask: Mask) -> None:
+    if mask.shape != picture.shape[:2] or mask.dtype != np.bool_:
+        raise InvalidInput("mask", f"{mask.dtype} {mask.shape} of a picture {picture.shape}")
+    if not mask.any():
+        raise InvalidInput("mask", "leaves no pixel to compare")
+
+
+def _ssim_of_plane(x: F64, y: F64, peak: float) -> F64:
+    """Return the SSIM around each pixel of one channel [H, W]."""
     c1, c2 = (K1 * peak) ** 2, (K2 * peak) ** 2
     mean_x, mean_y = _windowed(x), _windowed(y)
     covariance = _windowed(x * y) - mean_x * mean_y
@@ -99,7 +114,7 @@ def _ssim_of_plane(x: F64, y: F64, peak: float) -> float:
     spread = np.maximum(_windowed((x - y) ** 2) - (mean_x - mean_y) ** 2, 0.0)
     luminance = (2 * mean_x * mean_y + c1) / (mean_x * mean_x + mean_y * mean_y + c1)
     structure = 1.0 - spread / (np.maximum(2 * covariance + spread, 0.0) + c2)
-    return float(np.mean(luminance * structure))
+    return np.asarray(luminance * structure)
 
 
 def _windowed(plane: F64) -> F64:

@@ -68,17 +68,12 @@ def pixels_of(frame: av.VideoFrame, source: str, matrix: int | None = None) -> P
     Raises ``DatasetError`` naming ``source`` for a matrix or transfer that is not read, and for
     floating point that is not finite.
     """
-    is_float = any(kind in frame.format.name for kind in ("f16", "f32"))
-    transfer = frame.color_trc
-    if is_float and transfer == ColorTrc.UNSPECIFIED:
-        transfer = ColorTrc.LINEAR
+    transfer, is_float = _transfer(frame), _is_float(frame.format)
     if transfer in UNREAD:
         raise DatasetError(
             f"{source}: {UNREAD[ColorTrc(transfer)]} transfer is not read; save it as sRGB"
         )
-    is_as_shown = (
-        transfer != ColorTrc.LINEAR and transfer not in HDR and frame.color_primaries not in WIDE
-    )
+    is_as_shown = treatment(frame) is None
     if is_float:
         levels, white = _floats(frame, source), 65535
     else:
@@ -91,6 +86,30 @@ def pixels_of(frame: av.VideoFrame, source: str, matrix: int | None = None) -> P
     if not is_float:  # OpenEXR's colours are multiplied by alpha already
         rgb = (rgb.astype(np.uint16) * alpha[..., None] + 127) // 255
     return Pixels(np.ascontiguousarray(rgb, np.uint8), alpha >= OPAQUE)
+
+
+def has_alpha(pixel_format: av.VideoFormat) -> bool:
+    """Return whether pixels may be transparent."""
+    return pixel_format.has_palette or any(part.is_alpha for part in pixel_format.components)
+
+
+def treatment(frame: av.VideoFrame) -> str | None:
+    """Return what the frame is that is converted into sRGB, ``None`` for what is taken as it is."""
+    transfer = _transfer(frame)
+    if transfer == ColorTrc.LINEAR:
+        return "linear"
+    if transfer in HDR:
+        return HDR[ColorTrc(transfer)]
+    return "wide gamut" if frame.color_primaries in WIDE else None
+
+
+def _transfer(frame: av.VideoFrame) -> int:
+    is_unsaid = frame.color_trc == ColorTrc.UNSPECIFIED
+    return ColorTrc.LINEAR if is_unsaid and _is_float(frame.format) else frame.color_trc
+
+
+def _is_float(pixel_format: av.VideoFormat) -> bool:
+    return any(kind in pixel_format.name for kind in ("f16", "f32"))
 
 
 def _floats(frame: av.VideoFrame, source: str) -> Levels:
@@ -117,15 +136,14 @@ def _integers(
 
     swscale dithers RGB of 16 bits, but not YUV; its 16 bits of YUV have white at 255 * 256.
     """
-    parts = frame.format.components
-    has_alpha = frame.format.has_palette or any(part.is_alpha for part in parts)
+    parts, with_alpha = frame.format.components, has_alpha(frame.format)
     height, width = frame.height, frame.width
-    to, white = ("rgba" if has_alpha else "rgb24"), 255
+    to, white = ("rgba" if with_alpha else "rgb24"), 255
     if any(part.is_chroma and not frame.format.is_rgb for part in parts):
         if not is_as_shown:
-            to, white = ("gbrap16le" if has_alpha else "gbrp16le"), 65280
+            to, white = ("gbrap16le" if with_alpha else "gbrp16le"), 65280
     elif max(part.bits for part in parts) > 8:
-        to, white = ("rgba64le" if has_alpha else "rgb48le"), 65535
+        to, white = ("rgba64le" if with_alpha else "rgb48le"), 65535
     chroma = (frame.format.chroma_width(width), frame.format.chroma_height(height))
     try:
         if chroma != (width, height) and (height % 2 or width % 2):

@@ -44,6 +44,7 @@ below 0.001 / 0.25 / 0.5 / 0.75 / 0.9 / above is 0.082 / 0.065 / 0.062 / 0.061 /
 NOTHING_M = np.float32(1e-6)
 """Depths up to this mean that nothing was hit; no renderer draws so near."""
 F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 
 def confidence(depth_m: F32, opacity: F32) -> F32:
@@ -221,13 +222,19 @@ class HeldFieldView(FieldView):
 class PosedPicture:
     """A picture with the camera that took it; its pixels are read on request.
 
-    ``read`` returns uint8 [H, W, 3] RGB of exactly the camera's size.
+    ``read`` returns uint8 [H, W, 3] RGB of exactly the camera's size, ``mask`` bool [H, W]: which
+    pixels are learnt and measured; ``None`` stands for all of them.
     """
 
     name: str
     camera: Camera
     read: Callable[[], NDArray[np.uint8]]
     time_ns: int = 0
+    mask: Callable[[], Mask] | None = None
+
+    def read_mask(self) -> Mask | None:
+        """Return which pixels count, ``None`` for all of them."""
+        return None if self.mask is None else self.mask()
 
 
 def spread(pictures: Sequence[PosedPicture], most: int) -> list[PosedPicture]:

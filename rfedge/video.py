@@ -7,7 +7,9 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+from av.container import OutputContainer
 from av.video.reformatter import ColorRange
+from av.video.stream import VideoStream
 
 from rfcore.codec.h264.ffmpeg import SIGNAL, video_frame
 from rfcore.errors import InvalidInput
@@ -28,13 +30,7 @@ def write_mp4(path: Path, frames: Iterable[Rgb | I420], rate_hz: float) -> int:
     count = 0
     with av.open(str(path), "w") as container:
         rate = Fraction(rate_hz).limit_denominator(1000)
-        signal = ":".join(f"{name}={value}" for name, value in SIGNAL.items())
-        options = {"crf": "16", "preset": "fast", "x264-params": signal}
-        stream = container.add_stream("libx264", rate=rate, options=options)
-        stream.pix_fmt = "yuv420p"
-        codec = stream.codec_context
-        codec.color_range = ColorRange.MPEG
-        codec.colorspace = codec.color_primaries = codec.color_trc = BT709
+        stream = bt709_stream(container, rate, {"crf": "16", "preset": "fast"})
         for given in frames:
             picture = given if isinstance(given, I420) else i420_from_rgb(given)
             width, height = (side - side % 2 for side in picture.size_px)
@@ -49,3 +45,17 @@ def write_mp4(path: Path, frames: Iterable[Rgb | I420], rate_hz: float) -> int:
         path.unlink()
         raise InvalidInput("video", f"{path}: there is no picture to write")
     return count
+
+
+def bt709_stream(
+    container: OutputContainer, rate_hz: Fraction | None, options: dict[str, str]
+) -> VideoStream:
+    """Add a stream of H.264 that is tagged as BT.709 in limited range, which ``I420`` is."""
+    signal = ":".join(f"{name}={value}" for name, value in SIGNAL.items())
+    options = {**options, "x264-params": signal}
+    stream = container.add_stream("libx264", rate=rate_hz, options=options)
+    stream.pix_fmt = "yuv420p"
+    codec = stream.codec_context
+    codec.color_range = ColorRange.MPEG
+    codec.colorspace = codec.color_primaries = codec.color_trc = BT709
+    return stream

@@ -24,11 +24,11 @@ from types import TracebackType
 from typing import Protocol
 
 import av
-import numpy as np
 
+from rfcore.codec.h264.ffmpeg import video_frame
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
-from rfcore.image import I420, png_bytes
+from rfcore.image import png_bytes
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -37,6 +37,7 @@ from rfcore.wire.twin import (
 )
 from rfcore.wire.values import check_name
 from rfcore.wire.waits import waiting
+from rfedge.video import bt709_stream
 
 TICKS_PER_S = 90_000
 """Resolution of a video's times, as in MPEG systems."""
@@ -116,17 +117,17 @@ class PictureVideo:
             return
         self._last_tick = tick
         stream = self._stream = self._stream or self._open(picture)
-        frame = av.VideoFrame.from_ndarray(_even(picture.planes), format="yuv420p")
-        frame.pts, frame.time_base = tick, Fraction(1, TICKS_PER_S)
+        width, height = (side // 2 * 2 for side in picture.planes.size_px)
+        shown = picture.planes.cropped((width, height))
+        frame = video_frame(shown, (width, height), tick)
+        frame.time_base = Fraction(1, TICKS_PER_S)
         self._container.mux(stream.encode(frame))
 
     def _open(self, picture: TwinPicture) -> av.VideoStream:
-        stream = self._container.add_stream(
-            "libx264", options={"crf": "18", "preset": "veryfast", "bf": "0"}
-        )
+        options = {"crf": "18", "preset": "veryfast", "bf": "0"}
         k = picture.intrinsics
+        stream = bt709_stream(self._container, None, options)
         stream.width, stream.height = k.width_px // 2 * 2, k.height_px // 2 * 2
-        stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = Fraction(1, TICKS_PER_S)
         return stream
 
@@ -134,14 +135,6 @@ class PictureVideo:
 def _camera(picture: TwinPicture) -> tuple[str, str, int, int]:
     k = picture.intrinsics
     return (picture.vehicle_id, picture.camera_id, k.width_px, k.height_px)
-
-
-def _even(picture: I420) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """Return the planes as PyAV wants them, [3/2 H, W], an odd row or column cut off."""
-    height, width = (n // 2 * 2 for n in picture.y.shape)
-    chroma = (plane[: height // 2, : width // 2].reshape(-1) for plane in (picture.u, picture.v))
-    flat = np.concatenate([picture.y[:height, :width].reshape(-1), *chroma])
-    return flat.reshape(height * 3 // 2, width)
 
 
 LOOK_EVERY_S = 0.05

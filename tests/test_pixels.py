@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rfcore.camera import Intrinsics
-from rfcore.dataset.recording import Video
+from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError
 from rfcore.image import read_pixels, read_rgb, rgb_from_bytes
 from rfcore.pixels import pixels_of
@@ -104,10 +103,7 @@ def from_bytes(path: Path) -> np.ndarray:
 
 
 def from_video(path: Path) -> np.ndarray:
-    with av.open(str(path)) as container:
-        codec = container.streams.video[0].codec_context
-        width, height = codec.width, codec.height
-    return Video(path, Intrinsics(width, height, 50, 50, 30, 20)).read(0)
+    return Video(path).read(0)
 
 
 def from_sharpest(path: Path) -> np.ndarray:
@@ -122,7 +118,8 @@ def test_a_frame_is_converted_by_the_formula(size, pixel_format, matrix, full):
     frame = frame_of(*size, pixel_format, matrix, full=full)
     wanted = signal_of(frame, matrix, full=full, offset_x=0.5) * 255
     found = pixels_of(frame, "x").rgb
-    assert np.abs(found - wanted).max() <= 0.6
+    # swscale divides 10 bits of full range by 4, where 1023 / 255 would be right.
+    assert np.abs(found - wanted).max() <= (1.3 if full and pixel_format == "yuv420p10le" else 0.6)
 
 
 @pytest.mark.parametrize("size", ODD_AND_EVEN)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
@@ -28,7 +28,7 @@ from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.geodesy import Anchor
 from rfcore.image import Rgb
-from rfcore.views import PointCloud, PosedPicture
+from rfcore.views import Mask, PointCloud, PosedPicture
 
 
 def check_reduction(name: str, from_px: tuple[int, int], to_px: tuple[int, int]) -> None:
@@ -184,11 +184,23 @@ def _posed(picture: SourcePicture, origin: TileOrigin, options: ReadOptions) -> 
         intrinsics = intrinsics.cropped(*part).resized(*options.size_px)
         read = partial(_read, picture, options.size_px)
     camera = Camera(intrinsics, _near(picture, origin))
-    return PosedPicture(picture.name, camera, read, picture.time_ns or 0)
+    mask = None if picture.mask is None else partial(_mask, picture, picture.mask, options.size_px)
+    return PosedPicture(picture.name, camera, read, picture.time_ns or 0, mask)
+
+
+def _mask(
+    picture: SourcePicture, read: Callable[[], Mask], size_px: tuple[int, int] | None
+) -> Mask:
+    """Return the pixels that come from counted ones alone."""
+    levels = np.where(read()[..., None], np.uint8(255), np.uint8(0)).repeat(3, axis=2)
+    return np.asarray(_resampled(picture, levels, size_px)[..., 0] == 255)
 
 
 def _read(picture: SourcePicture, size_px: tuple[int, int] | None = None) -> Rgb:
-    rgb = picture.read()
+    return _resampled(picture, picture.read(), size_px)
+
+
+def _resampled(picture: SourcePicture, rgb: Rgb, size_px: tuple[int, int] | None) -> Rgb:
     lens = picture.camera.lens
     if lens is not None:
         rgb = undistorted(rgb, picture.camera.intrinsics, lens)

@@ -22,7 +22,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ from rfcore.dataset.keys import (
     table_at,
     text_lines,
 )
-from rfcore.dataset.picture_file import check_size, find_picture, read_picture
+from rfcore.dataset.picture_file import PictureFile, find_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
 from rfcore.errors import DatasetError
 from rfcore.tables import shortened
@@ -286,11 +285,13 @@ def _picture(model: ColmapModel, folder: Path, image: ColmapImage) -> SourcePict
     if camera is None:
         raise DatasetError(f"{image.where}: camera {image.camera_id} is not in the model")
     path = find_picture(image.where, folder, image.name)
-    check_size(path, camera.intrinsics)
+    opened = PictureFile.of(path, camera.intrinsics)
     return SourcePicture(
         where=image.where,
         name=image.name,
         camera=camera,
         world_from_cam=image.cam_from_world.inverse(),
-        read=partial(read_picture, path, camera.intrinsics),
+        read=opened.read,
+        mask=opened.mask,
+        notes=opened.notes,
     )

@@ -27,7 +27,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 
 from rfcore.camera import Intrinsics, Pose
@@ -38,7 +37,8 @@ from rfcore.dataset.keys import (
     pose_of_rows,
     text_lines,
 )
-from rfcore.dataset.picture_file import check_size, picture_size_px, read_picture
+from rfcore.dataset.picture_file import PictureFile
+from rfcore.dataset.picture_header import picture_header
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture
 from rfcore.dataset.trajectory import time_ns
 from rfcore.errors import DatasetError
@@ -100,18 +100,19 @@ def _pictures(
     posed: Sequence[tuple[str, Pose]],
     camera: SourceCamera,
 ) -> tuple[SourcePicture, ...]:
-    for path in paths:
-        check_size(path, camera.intrinsics)
+    opened = [PictureFile.of(path, camera.intrinsics) for path in paths]
     return tuple(
         SourcePicture(
             where=where,
-            name=path.name,
+            name=picture.path.name,
             camera=camera,
             world_from_cam=world_from_cam,
-            read=partial(read_picture, path, camera.intrinsics),
+            read=picture.read,
             time_ns=time,
+            mask=picture.mask,
+            notes=picture.notes,
         )
-        for path, time, (where, world_from_cam) in zip(paths, times_ns, posed, strict=True)
+        for picture, time, (where, world_from_cam) in zip(opened, times_ns, posed, strict=True)
     )
 
 
@@ -121,9 +122,7 @@ def _camera(file: Path, key: str, first: Path) -> tuple[SourceCamera, Pose]:
     p = _rows(where, rest)
     if p[0][1] or p[1][0] or p[2][:3] != [0.0, 0.0, 1.0]:
         raise DatasetError(f"{where}: is not K [I | t] of a rectified camera")
-    size_px = picture_size_px(first)
-    if size_px is None:
-        raise DatasetError(f"{first}: not a PNG or JPEG picture")
+    size_px = picture_header(first).size_px
     (fx_px, _, cx_px, a), (_, fy_px, cy_px, b), (_, _, _, c) = p
     with blamed_on(where):
         intrinsics = Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px)

@@ -1,27 +1,35 @@
-"""Picture files of a dataset: where they are and how large, before any pixel is decoded.
+"""Picture files of a dataset: where they are, how large, and which of their pixels count.
 
-Sizes come from the headers of PNG (W3C PNG, 11.2.1), JPEG (ITU-T T.81, B.2.2) and WebP (RFC 9649);
-a picture of another format is measured when it is read. So a picture of a hostile size is refused
-without allocating it, and a wrong size is found before a long run starts.
+A picture is read as it is stored or, where only that fits its camera, turned as its EXIF
+orientation says: COLMAP, instant-ngp and nerfstudio know nothing of EXIF. Its mask is the file that
+the dataset names, or one beside the pictures: ``masks/NAME.png`` or ``masks/STEM.png`` next to the
+folder ``images`` (COLMAP, gsplat, LichtFeld Studio), or instant-ngp's ``dynamic_mask_STEM.png``.
+White is learnt and measured, black is not, but for instant-ngp's masks, which are white where
+something moves. A transparent pixel is not learnt either.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+
+import numpy as np
 
 from rfcore.camera import MAX_SIDE_PX, Intrinsics
+from rfcore.dataset.orientation import Orientation
+from rfcore.dataset.picture_header import UNREAD, jpeg_segments, picture_format, picture_header
 from rfcore.errors import DatasetError
-from rfcore.image import Rgb, read_rgb
+from rfcore.image import Rgb, read_pixels
+from rfcore.pixels import Pixels
 from rfcore.tables import shortened
+from rfcore.views import Mask
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG", ".WEBP")
+"""Suffixes that a name without one may stand for."""
 MAX_PART_BYTES = 255
 """Longest file name of Linux file systems."""
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-JPEG_BARE = frozenset(range(0xD0, 0xD9)) | {0x01}
-JPEG_SCAN = frozenset({0xDA})
+JPEG_SCAN = 0xDA
 JPEG_END = b"\xff\xd9"
 
 
@@ -58,38 +66,143 @@ def picture_file(where: str, folder: Path, name: str) -> Path | None:
 
 def read_picture(path: Path, intrinsics: Intrinsics) -> Rgb:
     """Read a picture; raise ``DatasetError`` when its size is not the camera's."""
-    check_size(path, intrinsics)
-    _require_length(path, intrinsics)
-    _require_whole_jpeg(path)
-    rgb = read_rgb(path)
-    _require_size(path, (rgb.shape[1], rgb.shape[0]), intrinsics)
-    return rgb
+    return PictureFile.of(path, intrinsics).read()
 
 
-def check_size(path: Path, intrinsics: Intrinsics) -> None:
-    """Raise ``DatasetError`` when the header states another size than the camera's."""
-    size_px = picture_size_px(path)
-    if size_px is not None:
-        _require_size(path, size_px, intrinsics)
+@dataclass(frozen=True)
+class PictureFile:
+    """A picture file and its camera's intrinsics; pixels are read on demand.
+
+    ``notes`` says what reading does to it, for "N pictures ...".
+    """
+
+    path: Path
+    intrinsics: Intrinsics
+    orientation: Orientation
+    has_alpha: bool
+    mask_file: MaskFile | None
+    notes: tuple[str, ...]
+
+    @staticmethod
+    def of(path: Path, intrinsics: Intrinsics, mask: MaskFile | None = None) -> PictureFile:
+        """Open a picture; raise ``DatasetError`` when its header states another size."""
+        header = picture_header(path)
+        wanted_px = (intrinsics.width_px, intrinsics.height_px)
+        notes, orientation = [], Orientation.UPRIGHT
+        shown_px = header.orientation.size(header.size_px)
+        is_turned = header.orientation is not Orientation.UPRIGHT
+        if is_turned and header.size_px != wanted_px == shown_px:
+            orientation = header.orientation
+            notes.append(f"are {orientation.words}, as EXIF says and their camera's size")
+        else:
+            require_size(path, header.size_px, intrinsics)
+            if is_turned:
+                notes.append(
+                    f"are not {header.orientation.words}, though EXIF says so: their camera is of "
+                    "the picture as stored"
+                )
+        if header.treatment is not None:
+            notes.append(f"are {header.treatment} and become sRGB")
+        if header.has_alpha:
+            notes.append(
+                "have an alpha channel: they are composed over black, and what is transparent is "
+                "not learnt or measured"
+            )
+        mask = mask or mask_beside(path)
+        if mask is not None:
+            notes.append("have a mask: what it hides is not learnt or measured")
+        return PictureFile(path, intrinsics, orientation, header.has_alpha, mask, tuple(notes))
+
+    @property
+    def mask(self) -> Callable[[], Mask] | None:
+        """Reader of which pixels count, ``None`` for all of them."""
+        return self._mask if self.has_alpha or self.mask_file is not None else None
+
+    def read(self) -> Rgb:
+        """Read the pixels; raise ``DatasetError`` when their size is not the camera's."""
+        return self.orientation.shown(self._pixels().rgb)
+
+    def _pixels(self) -> Pixels:
+        PictureFile.of(self.path, self.intrinsics, self.mask_file)  # it may have been replaced
+        _require_length(self.path, self.intrinsics)
+        _require_whole_jpeg(self.path)
+        pixels = read_pixels(self.path)
+        height, width, _ = pixels.rgb.shape
+        require_size(self.path, self.orientation.size((width, height)), self.intrinsics)
+        return pixels
+
+    def _mask(self) -> Mask:
+        k = self.intrinsics
+        counted = np.ones((k.height_px, k.width_px), bool)
+        if self.has_alpha and (opaque := self._pixels().opaque) is not None:
+            counted &= self.orientation.shown(opaque)
+        if self.mask_file is not None:
+            counted &= self.mask_file.read(self)
+        return counted
 
 
-def picture_size_px(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) as the file's header states it, None for an unknown format."""
-    try:
-        with path.open("rb") as file:
-            start = file.read(32)
-            if start.startswith(PNG_SIGNATURE) and start[12:16] == b"IHDR":
-                return int.from_bytes(start[16:20]), int.from_bytes(start[20:24])
-            if start.startswith(b"\xff\xd8"):
-                return _jpeg_size_px(file)
-            if start[:4] == b"RIFF" and start[8:12] == b"WEBP":
-                return _webp_size_px(start)
-            return None
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from error
+@dataclass(frozen=True)
+class MaskFile:
+    """A mask's file; ``hides_white`` is instant-ngp's convention, the other hides black."""
+
+    path: Path
+    hides_white: bool = False
+
+    def read(self, picture: PictureFile) -> Mask:
+        """Return which pixels count, bool [H, W]; raise ``DatasetError`` for another size.
+
+        White is what is brighter than half of the brightest: some masks have 0 and 1.
+        """
+        width, height = picture_header(self.path).size_px
+        _require_length(self.path, replace(picture.intrinsics, width_px=width, height_px=height))
+        values = read_pixels(self.path).rgb.max(axis=2)
+        is_white = np.asarray(values > values.max() / 2)
+        k = picture.intrinsics
+        if is_white.shape != (k.height_px, k.width_px):
+            is_white = picture.orientation.shown(is_white)
+        if is_white.shape != (k.height_px, k.width_px):
+            raise DatasetError(
+                f"{self.path}: mask is {values.shape[1]}x{values.shape[0]} px, its picture "
+                f"{k.width_px}x{k.height_px}"
+            )
+        return np.asarray(is_white != self.hides_white)
 
 
-def _require_size(path: Path, size_px: tuple[int, int], intrinsics: Intrinsics) -> None:
+def mask_beside(path: Path) -> MaskFile | None:
+    """Return the mask that lies beside a picture, ``None`` without one."""
+    moving = path.with_name(f"dynamic_mask_{path.stem}.png")
+    if moving.is_file():
+        return MaskFile(moving, hides_white=True)
+    if path.parent.name == "masks":
+        return None
+    for folder in path.parents[:3]:
+        masks = folder.parent / "masks" / path.parent.relative_to(folder)
+        for name in (f"{path.name}.png", f"{path.stem}.png", path.name):
+            if masks.is_dir() and (masks / name).is_file():
+                return MaskFile(masks / name)
+    return None
+
+
+def picture_paths(folder: Path) -> list[Path]:
+    """Return the pictures of a folder, told by their content, in the order of their names.
+
+    Raises ``DatasetError`` for formats that are not read, and without any.
+    """
+    files = sorted(path for path in folder.glob("*") if path.is_file())
+    formats = {path: picture_format(path) for path in files}
+    paths = [path for path in files if formats[path] and "dynamic_mask_" not in path.name]
+    if not paths:
+        raise DatasetError(f"{folder}: holds no pictures (PNG, JPEG, WebP, TIFF, OpenEXR, ...)")
+    unread = [path for path in paths if formats[path] in UNREAD]
+    if unread:
+        raise DatasetError(
+            f"{folder}: {len(unread)} of {len(paths)} pictures are {formats[unread[0]]}, which is "
+            "not read; export them as JPEG or PNG"
+        )
+    return paths
+
+
+def require_size(path: Path, size_px: tuple[int, int], intrinsics: Intrinsics) -> None:
     if max(size_px) > MAX_SIDE_PX:
         raise DatasetError(
             f"{path}: picture is {size_px[0]}x{size_px[1]} px, over the limit of {MAX_SIDE_PX} px"
@@ -119,49 +232,12 @@ def _require_length(path: Path, intrinsics: Intrinsics) -> None:
         )
 
 
-def _jpeg_size_px(file: BinaryIO) -> tuple[int, int] | None:
-    if not _at_marker(file, JPEG_FRAMES):
-        return None
-    header = file.read(7)
-    return int.from_bytes(header[5:7]), int.from_bytes(header[3:5])
-
-
 def _require_whole_jpeg(path: Path) -> None:
     """FFmpeg fills what is missing of a JPEG with grey and reports nothing.
 
     In a scan 0xFF is followed by 0 or a restart marker only, so that an end marker is one.
     """
     with path.open("rb") as file:
-        if file.read(2) == b"\xff\xd8" and not (
-            _at_marker(file, JPEG_SCAN) and JPEG_END in file.read()
-        ):
+        is_jpeg = file.read(2) == b"\xff\xd8"
+        if is_jpeg and not (JPEG_SCAN in jpeg_segments(file) and JPEG_END in file.read()):
             raise DatasetError(f"{path}: truncated, the JPEG has no end marker")
-
-
-def _at_marker(file: BinaryIO, wanted: frozenset[int]) -> bool:
-    """Walk the marker segments from the start; stop behind the first wanted marker."""
-    file.seek(2)
-    while len(marker := file.read(2)) == 2 and marker[0] == 0xFF:
-        if marker[1] in wanted:
-            return True
-        if marker[1] == 0xFF:
-            file.seek(-1, 1)
-        elif marker[1] not in JPEG_BARE:
-            file.seek(max(int.from_bytes(file.read(2)) - 2, 0), 1)
-    return False
-
-
-def _webp_size_px(start: bytes) -> tuple[int, int] | None:
-    kind = start[12:16]
-    if kind == b"VP8X":
-        width_px = int.from_bytes(start[24:27], "little") + 1
-        return width_px, int.from_bytes(start[27:30], "little") + 1
-    if kind == b"VP8L":
-        bits = int.from_bytes(start[21:25], "little")
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    if kind == b"VP8 ":
-        return (
-            int.from_bytes(start[26:28], "little") & 0x3FFF,
-            int.from_bytes(start[28:30], "little") & 0x3FFF,
-        )
-    return None

@@ -32,7 +32,6 @@ import math
 import shlex
 from collections import ChainMap
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +51,13 @@ from rfcore.dataset.keys import (
 )
 from rfcore.dataset.kitti import OXTS, read_kitti_raw_source, read_kitti_source
 from rfcore.dataset.picture_file import (
-    SUFFIXES,
-    check_size,
+    MaskFile,
+    PictureFile,
     find_picture,
     inside,
     picture_file,
-    read_picture,
 )
+from rfcore.dataset.picture_header import picture_format
 from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
 from rfcore.dataset.recording import read_recording_source
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
@@ -138,16 +137,20 @@ def _picture(file: Path, content: dict[str, Any], index: int, frame: Any) -> Sou
     keys = table_at(where, frame)
     camera = _camera(where, table_at(where, ChainMap(frame, content)))
     rows = keys.matrix("transform_matrix", POSE_SHAPES)
-    path = find_picture(where, file.parent, name)
-    check_size(path, camera.intrinsics)
+    mask = None
+    if keys.value("mask_path", None) is not None:
+        mask = MaskFile(find_picture(f"{where}: mask", file.parent, keys.text("mask_path")))
+    opened = PictureFile.of(find_picture(where, file.parent, name), camera.intrinsics, mask)
     opencv_rows = [[r[0], -r[1], -r[2], r[3]] for r in rows]
     return SourcePicture(
         where=where,
         name=name,
         camera=camera,
         world_from_cam=pose_of_rows(where, "transform_matrix", opencv_rows),
-        read=partial(read_picture, path, camera.intrinsics),
+        read=opened.read,
         time_ns=round(keys.number("time", Range(0.0)) * 1e9) if "time" in keys else None,
+        mask=opened.mask,
+        notes=opened.notes,
     )
 
 
@@ -225,13 +228,15 @@ def _inria_picture(file: Path, index: int, entry: Any) -> SourcePicture:
     rotation = keys.matrix("rotation", ((3, 3),))
     rows = [[*row, t] for row, t in zip(rotation, position, strict=True)]
     path = find_picture(where, file.parent / "images", name)
-    check_size(path, camera.intrinsics)
+    opened = PictureFile.of(path, camera.intrinsics)
     return SourcePicture(
         where=where,
         name=name,
         camera=camera,
         world_from_cam=pose_of_rows(where, "rotation", rows),
-        read=partial(read_picture, path, camera.intrinsics),
+        read=opened.read,
+        mask=opened.mask,
+        notes=opened.notes,
     )
 
 
@@ -322,7 +327,7 @@ def _refuse_pictures_alone(folder: Path) -> None:
     """Raise ``DatasetError`` for a folder of pictures, saying how their poses are found."""
     for place in (folder, folder / "images"):
         files = place.iterdir() if place.is_dir() else ()
-        count = sum(file.suffix in SUFFIXES for file in files)
+        count = sum(picture_format(file) is not None for file in files)
         if count:
             raise DatasetError(
                 f"{place}: holds {count} pictures and no poses; find those by structure from "

@@ -20,13 +20,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import blamed_on, read_file, table_at
-from rfcore.dataset.picture_file import check_size, find_picture, read_picture
+from rfcore.dataset.picture_file import PictureFile, find_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture
 from rfcore.errors import DatasetError
 from rfcore.tables import Range, Table
@@ -99,14 +98,13 @@ class RecordedPart:
         prefix = f"{self.camera.vehicle_id}/{self.camera.camera_id}/{self.file.parent.name}"
         for picture in self.pictures:
             if picture.world_from_cam is not None:
-                path = self.path(picture)
-                check_size(path, camera.intrinsics)
+                opened = PictureFile.of(self.path(picture), camera.intrinsics)
                 yield SourcePicture(
                     where=f"{self.file}: {picture.file}",
                     name=f"{prefix}/{picture.file}",
                     camera=camera,
                     world_from_cam=picture.world_from_cam,
-                    read=partial(read_picture, path, camera.intrinsics),
+                    read=opened.read,
                     time_ns=picture.capture_time_ns,
                 )
 

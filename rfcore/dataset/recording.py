@@ -53,13 +53,14 @@ from rfcore.dataset.keys import (
     pose_of_rows,
     table_at,
 )
-from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
+from rfcore.dataset.picture_file import PictureFile, inside, picture_paths
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
 from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb
 from rfcore.tables import Range, Table
+from rfcore.views import Mask
 
 SECTIONS = {
     "camera": "model width_px height_px fx_px fy_px cx_px cy_px k1 k2 k3 k4 p1 p2",
@@ -129,6 +130,8 @@ class TimedPicture:
     name: str
     time_ns: int
     read: Callable[[], Rgb]
+    mask: Callable[[], Mask] | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -159,6 +162,8 @@ def read_recording_source(file: Path) -> Source:
             world_from_cam=poses.at(f"{file}: {picture.name}", picture.time_ns).compose(timed.turn),
             read=picture.read,
             time_ns=picture.time_ns + poses.offset_ns,
+            mask=picture.mask,
+            notes=picture.notes,
         )
         for picture in timed.pictures
         if poses.wanted(picture.time_ns)
@@ -243,15 +248,13 @@ def _video_pictures(where: str, folder: Path, keys: Table, camera: SourceCamera)
 
 def _folder_pictures(where: str, folder: Path, keys: Table, camera: SourceCamera) -> TimedPictures:
     pictures = inside(where, folder, keys.text("folder"))
-    paths = sorted(path for path in pictures.glob("*") if path.suffix in SUFFIXES)
-    if not paths:
-        raise DatasetError(f"{where}: folder {pictures} holds no pictures ({', '.join(SUFFIXES)})")
+    with blamed_on(where):
+        paths = picture_paths(pictures)
     times_ns = _folder_times_ns(where, folder, keys, len(paths))
-    for path in paths:
-        check_size(path, camera.intrinsics)
+    opened = [PictureFile.of(path, camera.intrinsics) for path in paths]
     timed = [
-        TimedPicture(path.name, time, partial(read_picture, path, camera.intrinsics))
-        for path, time in zip(paths, times_ns, strict=True)
+        TimedPicture(picture.path.name, time, picture.read, picture.mask, picture.notes)
+        for picture, time in zip(opened, times_ns, strict=True)
     ]
     return TimedPictures(timed, camera, Pose.identity())
 

@@ -19,6 +19,7 @@ from rfcore.field.ply_table import Table, read_vertices
 from rfcore.geodesy import Anchor
 from rfcore.image import Rgb
 from rfcore.lens import Lens
+from rfcore.views import Mask
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,11 @@ class SourceCamera:
 
 @dataclass(frozen=True)
 class SourcePicture:
-    """A picture as it was taken. ``where`` is the place in the file that names it, for errors."""
+    """A picture as it was taken. ``where`` is the place in the file that names it, for errors.
+
+    ``mask`` returns bool [H, W]: which pixels are learnt and measured. ``notes`` says what reading
+    does to the picture.
+    """
 
     where: str
     name: str
@@ -39,6 +44,8 @@ class SourcePicture:
     world_from_cam: Pose
     read: Callable[[], Rgb]
     time_ns: int | None = None
+    mask: Callable[[], Mask] | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -28,14 +28,13 @@ import numpy as np
 from av.container import InputContainer
 from av.error import FFmpegError
 from av.video.codeccontext import VideoCodecContext
-from av.video.reformatter import ColorTrc
 from av.video.stream import VideoStream
 
 from rfcore.camera import MAX_SIDE_PX
 from rfcore.dataset.orientation import Orientation
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, rgb_from_video_frame
-from rfcore.pixels import HDR
+from rfcore.pixels import HDR, treatment
 
 CONTAINERS = {
     "mov": "MP4, MOV, 3GP",
@@ -68,6 +67,9 @@ def open_video(file: Path) -> InputContainer:
         container = av.open(str(file.absolute()), options={"format_whitelist": WHITELIST})
         if not container.streams.video:
             raise DatasetError(f"{file}: holds no video")
+        codec = container.streams.video[0].codec_context
+        if isinstance(codec, VideoCodecContext):
+            codec.thread_type = "AUTO"
     except (FFmpegError, OSError, ValueError) as error:
         raise DatasetError(f"{file}: not a readable video ({error})") from error
     return container
@@ -101,7 +103,7 @@ class VideoIndex:
     times_ns: tuple[int, ...]
     pts: tuple[int | None, ...]
     keys: tuple[int, ...]
-    """Numbers of the frames at which a seek may end."""
+    """Numbers of the frames at which reading may begin: 0, and those that are sought."""
     size_px: tuple[int, int]
     """Width and height as stored."""
     orientation: Orientation
@@ -145,8 +147,7 @@ class Video:
                 ) from error
 
     def _frame(self, number: int) -> av.VideoFrame:
-        keys = self.index.keys
-        key = keys[bisect_right(keys, number) - 1] if keys else 0
+        key = self.index.keys[bisect_right(self.index.keys, number) - 1]
         if number < self._next or key > self._next:
             self._jump(key)
         while True:
@@ -185,8 +186,6 @@ def _put_back(first: av.VideoFrame, rest: Iterator[av.VideoFrame]) -> Iterator[a
 
 def _frames(container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
     """Yield frames as they are shown; packets before the first one that can be decoded are none."""
-    if isinstance(stream.codec_context, VideoCodecContext):
-        stream.codec_context.thread_type = "AUTO"
     has_begun = False
     for packet in container.demux(stream):
         try:
@@ -203,17 +202,19 @@ def _frames(container: InputContainer, stream: VideoStream) -> Iterator[av.Video
 
 def _index(file: Path) -> VideoIndex:
     pts: list[int | None] = []
-    keys: list[int] = []
+    keys = [0]
     first: av.VideoFrame | None = None
     with open_video(file) as container:
         stream = container.streams.video[0]
         if stream.codec_context is None:
             raise DatasetError(f"{file}: is of a codec that is not known")
+        if container.format.name.startswith("mov"):
+            _require_whole_boxes(file)
         try:
             for frame in _frames(container, stream):
                 first = first or frame
                 _check_frame(file, len(pts), frame, first)
-                if frame.key_frame:
+                if frame.key_frame and pts:
                     keys.append(len(pts))
                 pts.append(frame.pts)
         except FFmpegError as error:
@@ -222,10 +223,6 @@ def _index(file: Path) -> VideoIndex:
             ) from error
         if first is None:
             raise DatasetError(f"{file}: holds no frames")
-        if stream.frames > len(pts) and _packets(file) < stream.frames:
-            raise DatasetError(
-                f"{file}: lists {stream.frames} frames and holds {len(pts)}; the file is cut"
-            )
         times_ns, is_stated = _times_ns(file, stream, pts)
         seekable = is_stated and container.format.name.split(",")[0] in SOUGHT
         orientation = _orientation(file, first)
@@ -235,7 +232,7 @@ def _index(file: Path) -> VideoIndex:
             notes.append(f"frames state no times in order: {float(rate):g} a second are taken")
     size_px = (first.width, first.height)
     return VideoIndex(
-        times_ns, tuple(pts), tuple(keys) if seekable else (), size_px, orientation, tuple(notes)
+        times_ns, tuple(pts), tuple(keys) if seekable else (0,), size_px, orientation, tuple(notes)
     )
 
 
@@ -253,10 +250,20 @@ def _check_frame(file: Path, number: int, frame: av.VideoFrame, first: av.VideoF
         raise DatasetError(f"{file}: frame {number} is damaged; cut the video before or after it")
 
 
-def _packets(file: Path) -> int:
-    """Return how many packets with data the file has, hidden ones too."""
-    with open_video(file) as container:
-        return sum(1 for packet in container.demux(video=0) if packet.size)
+def _require_whole_boxes(file: Path) -> None:
+    """Raise ``DatasetError`` where a box of MP4 ends behind the file, which FFmpeg reads on."""
+    length, at = file.stat().st_size, 0
+    with file.open("rb") as content:
+        while at + 8 <= length:
+            content.seek(at)
+            header = content.read(16)
+            size = int.from_bytes(header[:4])
+            size = int.from_bytes(header[8:]) if size == 1 else size or length - at
+            if size < 8 or at + size > length:
+                raise DatasetError(
+                    f"{file}: is cut: {at + size} bytes are stated and {length} are there"
+                )
+            at += size
 
 
 def _times_ns(
@@ -294,9 +301,9 @@ def _notes(frame: av.VideoFrame, orientation: Orientation) -> list[str]:
     notes = []
     if orientation is not Orientation.UPRIGHT:
         notes.append(f"frames are {orientation.words}, as the file says")
-    if frame.color_trc in HDR:
-        hdr = HDR[ColorTrc(frame.color_trc)]
-        notes.append(f"{hdr} becomes BT.709; white is 203 cd/m2, and what is brighter")
+    if (said := treatment(frame)) is not None:
+        white = "; white is 203 cd/m2, and what is brighter" if said in HDR.values() else ""
+        notes.append(f"{said} becomes BT.709{white}")
     if frame.interlaced_frame:
         notes.append("frames are marked as interlaced: what moves may show two times, line by line")
     return notes

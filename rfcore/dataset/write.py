@@ -33,6 +33,7 @@ class WrittenPicture:
     camera: SourceCamera
     world_from_cam: Pose
     time_ns: int | None = None
+    mask_path: str | None = None
 
 
 def write_transforms(
@@ -66,6 +67,8 @@ def transforms_of(pictures: Sequence[WrittenPicture], points_name: str | None) -
 
 def _frame(picture: WrittenPicture, own_camera: bool) -> dict[str, Any]:
     frame: dict[str, Any] = {"file_path": picture.file_path}
+    if picture.mask_path is not None:
+        frame["mask_path"] = picture.mask_path
     if picture.time_ns is not None:
         frame["time"] = picture.time_ns / 1e9
     if own_camera:

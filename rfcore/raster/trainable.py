@@ -20,7 +20,7 @@ from rfcore.native import _native
 from rfcore.native.backend import check_backend
 from rfcore.raster.gaussians import F32, MAX_GAUSSIANS, Gaussians, empty_arrays
 from rfcore.raster.native import bands_to_use, native_camera, overlaps_limited
-from rfcore.views import View
+from rfcore.views import Mask, View
 
 DEAD_LOGIT = -5.293305
 """An opacity of 0.005; less is invisible on an 8-bit display."""
@@ -100,6 +100,12 @@ class Exposure:
                 raise InvalidInput(
                     f"exposure.{name}", f"must be contiguous {dtype.__name__} [3, 4]"
                 )
+
+    def mapped(self, colour: F32) -> F32:
+        """Return the mapped picture [H, W, 3], to the bit as the kernel maps it."""
+        a = self.affine
+        red, green, blue = (colour[..., i, None] for i in range(3))
+        return np.asarray(a[:, 0] * red + a[:, 1] * green + a[:, 2] * blue + a[:, 3])
 
 
 @dataclass(frozen=True)
@@ -221,10 +227,12 @@ class TrainableRasterizer:
         *,
         sh_degree: int | None = None,
         exposure: Exposure | None = None,
+        mask: Mask | None = None,
     ) -> float:
         """Run forward (colour only), loss, backward and one step of Adam; return the loss.
 
         With ``exposure`` the loss is that of the mapped picture, and its gradient is filled in.
+        Outside ``mask`` bool [H, W] the target is what is rendered: nothing is learnt there.
         """
         colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
         _check_picture("target", target, colour)
@@ -232,6 +240,9 @@ class TrainableRasterizer:
         with self._lock, overlaps_limited():
             self._forget()
             self._native.forward_colour(seen_from, degree, colour)
+            if mask is not None:
+                shown = colour if exposure is None else exposure.mapped(colour)
+                target = np.where(mask[..., None], target, shown)
             if exposure is None:
                 value = self._native.loss(colour, target, DSSIM_WEIGHT)
             else:

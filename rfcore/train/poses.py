@@ -28,7 +28,7 @@ from rfcore.field import SplatField
 from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.trainable import TrainableRasterizer
-from rfcore.train.targets import PictureAdam
+from rfcore.train.targets import PictureAdam, Target
 from rfcore.views import PosedPicture
 
 F32 = NDArray[np.float32]
@@ -146,11 +146,10 @@ def align_pictures(
     aligned = []
     for picture in pictures:
         model = _Alone([picture.camera], depth_m)
-        target = picture.read().astype(np.float32) / np.float32(255)
+        target = Target(picture.camera, picture.read(), mask=picture.read_mask())
         for number in range(ALIGN_STEPS):
             camera = model.camera(0)
-            rasterizer.forward(camera)
-            rasterizer.loss(target)
+            rasterizer.loss(target.colour_beside(rasterizer.forward(camera).colour))
             rasterizer.backward()
             centre_m = camera.world_from_cam.translation_m
             gradient = pose_gradient(field.gaussians, rasterizer.gradients(), centre_m)

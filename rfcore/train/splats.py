@@ -230,6 +230,7 @@ class SplatTrainer(FieldTrainer):
             rates,
             sh_degree=config.bands.at(progress),
             exposure=exposure,
+            mask=target.mask,
         )
         if self._exposure is not None and exposure is not None:
             self._exposure.step(view, exposure.gradient, config.rates.factor(progress))
@@ -246,8 +247,8 @@ class SplatTrainer(FieldTrainer):
         target = self._target(view, progress)
         camera = replace(poses.camera(view), intrinsics=target.camera.intrinsics)
         rasterizer = self._rasterizer
-        rasterizer.forward(camera, sh_degree=self.config.bands.at(progress))
-        loss = rasterizer.loss(target.colour())
+        shown = rasterizer.forward(camera, sh_degree=self.config.bands.at(progress)).colour
+        loss = rasterizer.loss(target.colour_beside(shown))
         rasterizer.backward()
         centre_m = camera.world_from_cam.translation_m
         gradient = pose_gradient(self.gaussians(), rasterizer.gradients(), centre_m)

@@ -129,6 +129,10 @@ def _along_rays(
 ) -> tuple[F64, NDArray[np.uint8]]:
     k = picture.camera.intrinsics
     u, v = rng.integers(0, k.width_px, count), rng.integers(0, k.height_px, count)
+    if (mask := picture.read_mask()) is not None and mask.any():
+        rows, columns = np.nonzero(mask)
+        chosen = (v * k.width_px + u) % len(rows)
+        u, v = columns[chosen], rows[chosen]
     log_z = rng.uniform(np.log(start.nearest), np.log(start.farthest), count)
     xyz_m = _in_world(
         picture.camera, np.float64(0.5) + u, np.float64(0.5) + v, np.exp(log_z) * unit_m
@@ -285,6 +289,9 @@ def _colours_at_infinity(target: Target, towards: F64) -> NDArray[np.int16]:
     colours = np.full(towards.shape, NOT_SEEN, np.int16)
     rows, columns = v[is_inside].astype(np.int64), u[is_inside].astype(np.int64)
     colours[is_inside] = target.rgb[rows, columns]
+    if target.mask is not None:
+        is_inside[is_inside] = ~target.mask[rows, columns]
+        colours[is_inside] = NOT_SEEN
     return colours
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.ngp.trainable import RayBatch
 from rfcore.raster.trainable import Exposure
-from rfcore.views import PosedPicture
+from rfcore.views import Mask, PosedPicture
 
 F64 = NDArray[np.float64]
 EXPOSURE_RATE = 3e-3
@@ -32,33 +32,46 @@ NO_CHANGE = np.eye(3, 4)
 
 @dataclass(frozen=True)
 class Target:
-    """A camera and what it saw: ``rgb`` uint8 [H, W, 3]."""
+    """A camera and what it saw: ``rgb`` uint8 [H, W, 3].
+
+    ``mask`` bool [H, W] says which pixels are learnt; ``None`` stands for all of them.
+    """
 
     camera: Camera
     rgb: Rgb
+    mask: Mask | None = field(default=None, kw_only=True)
 
     def colour(self) -> NDArray[np.float32]:
         """Return the picture as float32 [H, W, 3] in 0..1."""
         return self.rgb.astype(np.float32) / np.float32(255.0)
+
+    def colour_beside(self, shown: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return ``colour``, outside the mask that of ``shown``, where nothing is to be learnt."""
+        colour = self.colour()
+        return colour if self.mask is None else np.where(self.mask[..., None], colour, shown)
 
 
 def load_targets(pictures: Sequence[PosedPicture]) -> tuple[tuple[Target, ...], str]:
     """Read every picture; return them with the SHA-256, in hex, of their cameras and pixels."""
     if not pictures:
         raise InvalidInput("pictures", "at least one is needed to train a field")
-    targets = tuple(Target(picture.camera, picture.read()) for picture in pictures)
+    targets = tuple(Target(p.camera, p.read(), mask=p.read_mask()) for p in pictures)
+    if not any(target.mask is None or target.mask.any() for target in targets):
+        raise InvalidInput("pictures", "their masks leave no pixel to learn")
     digest = hashlib.sha256()
     for target in targets:
         digest.update(repr(target.camera).encode())
         digest.update(np.ascontiguousarray(target.rgb).data)
+        if target.mask is not None:
+            digest.update(np.packbits(target.mask).data)
     return targets, digest.hexdigest()
 
 
 def halved(target: Target) -> Target:
     """Return a picture of half the size: means of 2x2 pixels, rounded to nearest, a half up.
 
-    The last row or column of an odd number is left out. Raises ``InvalidInput`` for a picture of
-    one row or column.
+    A pixel is learnt if all four are. The last row or column of an odd number is left out. Raises
+    ``InvalidInput`` for a picture of one row or column.
     """
     k = target.camera.intrinsics
     width, height = k.width_px // 2, k.height_px // 2
@@ -67,17 +80,24 @@ def halved(target: Target) -> Target:
     intrinsics = Intrinsics(width, height, k.fx_px / 2, k.fy_px / 2, k.cx_px / 2, k.cy_px / 2)
     quads = target.rgb[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
     rgb = ((quads.sum(axis=(1, 3), dtype=np.uint16) + 2) // 4).astype(np.uint8)
-    return Target(replace(target.camera, intrinsics=intrinsics), np.ascontiguousarray(rgb))
+    mask = None
+    if target.mask is not None:
+        cut = target.mask[: 2 * height, : 2 * width]
+        mask = np.asarray(cut.reshape(height, 2, width, 2).all(axis=(1, 3)))
+    return Target(
+        replace(target.camera, intrinsics=intrinsics), np.ascontiguousarray(rgb), mask=mask
+    )
 
 
 class RaySampler:
-    """Draws pixels of ``targets`` uniformly."""
+    """Draws pixels of ``targets`` uniformly, those that their masks leave."""
 
     def __init__(self, targets: Sequence[Target], seed: int) -> None:
         self._seed = seed
         self._pixels = np.concatenate([target.rgb.reshape(-1, 3) for target in targets])
         sizes = [target.rgb.shape[0] * target.rgb.shape[1] for target in targets]
         self._starts = np.concatenate([[0], np.cumsum(sizes)])
+        self._drawn = _drawn_pixels(targets)
         intrinsics = [target.camera.intrinsics for target in targets]
         self._widths = np.array([k.width_px for k in intrinsics])
         self._focal = np.array([(k.fx_px, k.fy_px) for k in intrinsics])
@@ -90,7 +110,10 @@ class RaySampler:
         """Return batch ``number`` of ``blocks`` blocks of ``rays_per_block`` rays."""
         rng = np.random.default_rng((self._seed, number))
         count = rays_per_block * blocks
-        pixel = rng.integers(0, len(self._pixels), count)
+        if self._drawn is None:
+            pixel = rng.integers(0, len(self._pixels), count)
+        else:
+            pixel = self._drawn[rng.integers(0, len(self._drawn), count)]
         view = np.searchsorted(self._starts, pixel, side="right") - 1
         return RayBatch(
             origins=self._position[view],
@@ -109,6 +132,17 @@ class RaySampler:
         m = self._rotation[view]
         turned = m[:, :, 0] * x[:, None] + m[:, :, 1] * y[:, None] + m[:, :, 2]
         return np.ascontiguousarray(turned / length[:, None], dtype=np.float32)
+
+
+def _drawn_pixels(targets: Sequence[Target]) -> NDArray[np.int64] | None:
+    """Return the numbers of the pixels that are drawn, ``None`` for all of them."""
+    if all(target.mask is None for target in targets):
+        return None
+    masks = [
+        np.ones(target.rgb.shape[:2], bool) if target.mask is None else target.mask
+        for target in targets
+    ]
+    return np.flatnonzero(np.concatenate([mask.ravel() for mask in masks]))
 
 
 class PictureAdam:

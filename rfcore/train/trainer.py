@@ -290,17 +290,19 @@ def _sizes(parameters: Any) -> dict[str, float]:
 def mean_psnr_db(field: RadianceField, pictures: Sequence[PosedPicture]) -> float:
     """Return the mean over pictures of the RGB PSNR of the field's view, clipped to 0..1."""
     _check(pictures)
-    return float(np.mean([psnr(*_pair(field, p), peak=1.0) for p in pictures]))
+    values = [psnr(*_pair(field, p), peak=1.0, mask=p.read_mask()) for p in pictures]
+    return float(np.mean(values))
 
 
 def held_out_quality(field: RadianceField, pictures: Sequence[PosedPicture]) -> HeldOut:
     """Return the means over pictures of RGB PSNR and SSIM of the field's view."""
     _check(pictures)
-    pairs = [_pair(field, picture) for picture in pictures]
-    return HeldOut(
-        psnr_db=float(np.mean([psnr(*pair, peak=1.0) for pair in pairs])),
-        ssim=float(np.mean([ssim(*pair, peak=1.0) for pair in pairs])),
-    )
+    psnr_db, similarity = [], []
+    for picture in pictures:
+        pair, mask = _pair(field, picture), picture.read_mask()
+        psnr_db.append(psnr(*pair, peak=1.0, mask=mask))
+        similarity.append(ssim(*pair, peak=1.0, mask=mask))
+    return HeldOut(float(np.mean(psnr_db)), float(np.mean(similarity)))
 
 
 def mean_colour_db(shown: Sequence[PosedPicture], seen: Sequence[PosedPicture]) -> float:

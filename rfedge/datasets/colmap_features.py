@@ -17,7 +17,7 @@ import numpy as np
 
 from rfcore.camera import Pose
 from rfcore.dataset.colmap import camera_of, parameter_count
-from rfcore.dataset.picture_file import picture_size_px
+from rfcore.dataset.picture_header import picture_header
 from rfcore.dataset.source import SourceCamera, SourcePicture
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.extras import needs
@@ -159,7 +159,7 @@ def _shared_camera(root: Path, names: Sequence[str], cameras: Sequence[pycolmap.
         )
     size_px = (cameras[0].width, cameras[0].height)
     for name in names:
-        found = picture_size_px(root / name)
+        found = picture_header(root / name).size_px
         if found != size_px:
             raise DatasetError(
                 f"{Path(name).name}: {found} px is not the {size_px} px of the dataset's camera; "

@@ -66,12 +66,18 @@ def write_in_own_world(
     for number, picture in numbered:
         name = f"images/{number:06d}.png"
         write_png(folder / name, picture.read())
+        mask_path = None
+        if (mask := picture.read_mask()) is not None:
+            (folder / "masks").mkdir(exist_ok=True)
+            mask_path = f"masks/{number:06d}.png"
+            write_png(folder / mask_path, np.where(mask[..., None], LEARNT, HIDDEN))
         written.append(
             WrittenPicture(
                 file_path=name,
                 camera=SourceCamera(picture.camera.intrinsics),
                 world_from_cam=origin.globalise(picture.camera.world_from_cam),
                 time_ns=picture.time_ns if timed else None,
+                mask_path=mask_path,
             )
         )
     if anchor is not None:
@@ -87,6 +93,8 @@ def global_points(dataset: Dataset) -> SourcePoints | None:
     return SourcePoints(xyz_m, dataset.points.rgb)
 
 
+LEARNT, HIDDEN = np.full(3, 255, np.uint8), np.zeros(3, np.uint8)
+"""Colours of a mask's pixels."""
 LIST_NAME = "tiles.json"
 MOST_TILES = 1000
 LEAST_SIDE_M = 1.0

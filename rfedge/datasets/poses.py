@@ -17,13 +17,16 @@ import numpy as np
 
 from rfcore.camera import Pose, TileOrigin
 from rfcore.dataset.assemble import Distortion, chosen_origin
-from rfcore.dataset.picture_file import SUFFIXES
+from rfcore.dataset.orientation import Orientation
+from rfcore.dataset.picture_file import picture_paths
+from rfcore.dataset.picture_header import picture_header
 from rfcore.dataset.read import read_dataset, read_source, refuse_video
 from rfcore.dataset.source import SourceCamera, SourcePicture, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError
 from rfcore.extras import needs
 from rfcore.files import whole_folder
+from rfcore.image import read_rgb, write_png
 from rfedge.datasets.colmap_features import (
     DATABASE,
     PoseSettings,
@@ -42,6 +45,8 @@ with needs("colmap"):
 Tell = Callable[[str], None]
 """Called with a line that says what is being done."""
 MIN_PICTURES = 3
+PLAIN = ("PNG", "JPEG", "WebP")
+"""Formats that COLMAP reads."""
 ANY_FORWARD_MOTION = 1.0
 """A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
 START_ANGLES_DEG = (16.0, 2.0)
@@ -66,9 +71,7 @@ def pose_dataset(
     with whole_folder(out) as folder, TemporaryDirectory(dir=folder) as work:
         root = Path(work)
         (root / "new").mkdir()
-        for path in paths:
-            shutil.copyfile(path, root / "new" / path.name)
-        names = [f"new/{path.name}" for path in paths]
+        names = [f"new/{_copied(path, root / 'new', tell).name}" for path in paths]
         solution = solve_poses(root, names, known, settings, tell)
         _write(folder, root, names, solution)
         if register_to is None:
@@ -90,17 +93,31 @@ def _check_lens(images: Path, folder: Path, placed: str) -> None:
 
 def _pictures(images: Path, at_least: int) -> Sequence[Path]:
     refuse_video(images)
-    found = sorted(images.glob("*"))
-    paths = [path for path in found if path.suffix in SUFFIXES]
-    if not paths:
-        for path in found:
+    try:
+        paths = picture_paths(images)
+    except DatasetError:
+        for path in sorted(images.glob("*")):
             refuse_video(path)
+        raise
     if len(paths) < at_least:
-        raise DatasetError(
-            f"{images}: holds {len(paths)} pictures ({', '.join(SUFFIXES[:4])}), "
-            f"at least {at_least} are needed"
-        )
+        raise DatasetError(f"{images}: holds {len(paths)} pictures, at least {at_least} are needed")
     return paths
+
+
+def _copied(path: Path, folder: Path, tell: Tell) -> Path:
+    """Copy a picture; as PNG where COLMAP would not read it as it is shown.
+
+    What is turned by EXIF is turned here, since COLMAP knows nothing of it.
+    """
+    header = picture_header(path)
+    upright = header.orientation is Orientation.UPRIGHT
+    if upright and header.format in PLAIN and not (header.has_alpha or header.treatment):
+        return Path(shutil.copyfile(path, folder / path.name))
+    target = folder / f"{path.name}.png"
+    write_png(target, header.orientation.shown(read_rgb(path)))
+    words = header.orientation.words if not upright else f"{header.format}, written as PNG"
+    tell(f"{path.name}: {words}")
+    return target
 
 
 def _write(folder: Path, root: Path, names: Sequence[str], solution: PlacedPictures) -> None:

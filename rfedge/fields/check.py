@@ -208,7 +208,7 @@ def pairs_picture(
     rows, values_db = [], []
     for picture in spread(pictures, PAIRS):
         camera, render = picture.read(), rgb_from_colour(view.colour(picture.camera, convention))
-        values_db.append(psnr(render, camera))
+        values_db.append(psnr(render, camera, mask=picture.read_mask()))
         rows.append(_shrunk(np.hstack([camera, render])))
     width = min(row.shape[1] for row in rows)
     return np.vstack([row[:, :width] for row in rows]), values_db
@@ -310,8 +310,9 @@ def _probed_error(view: _FieldInDrive, probes: Sequence[_Probe], convention: Con
 def _psnr_db(
     view: _FieldInDrive, pictures: Sequence[PosedPicture], convention: Convention
 ) -> float:
-    renders = [(rgb_from_colour(view.colour(p.camera, convention)), p.read()) for p in pictures]
-    return float(np.mean([psnr(render, seen) for render, seen in renders]))
+    renders = [rgb_from_colour(view.colour(p.camera, convention)) for p in pictures]
+    pairs = zip(renders, pictures, strict=True)
+    return float(np.mean([psnr(rgb, p.read(), mask=p.read_mask()) for rgb, p in pairs]))
 
 
 def _shrunk(rgb: Rgb) -> Rgb:

@@ -195,8 +195,11 @@ def _mean_psnr_db(
     field: RadianceField, pictures: Sequence[PosedPicture], quality: Quality
 ) -> float:
     colours = [field.render_colour(picture.camera, quality) for picture in pictures]
-    pairs = zip(colours, pictures, strict=True)
-    return float(np.mean([psnr(rgb_from_colour(colour), seen.read()) for colour, seen in pairs]))
+    values = [
+        psnr(rgb_from_colour(colour), seen.read(), mask=seen.read_mask())
+        for colour, seen in zip(colours, pictures, strict=True)
+    ]
+    return float(np.mean(values))
 
 
 def _quality(psnr_db: float | None, ssim: float | None) -> str:

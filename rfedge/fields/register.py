@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, Pose, Vec3
-from rfcore.dataset.picture_file import SUFFIXES, picture_size_px, read_picture
+from rfcore.dataset.picture_file import picture_paths, read_picture
+from rfcore.dataset.picture_header import picture_header
 from rfcore.dataset.source import SourceCamera
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError, InvalidInput
@@ -128,13 +129,8 @@ def register_pictures(
     Raises ``DatasetError`` where there are no pictures or none is found, ``InvalidInput`` for a
     camera that is not known or an ``out`` that exists.
     """
-    paths = sorted(path for path in images.glob("*") if path.suffix in SUFFIXES)
-    if not paths:
-        raise DatasetError(f"{images}: holds no pictures ({', '.join(SUFFIXES[:4])})")
-    size_px = picture_size_px(paths[0])
-    if size_px is None:
-        raise DatasetError(f"{paths[0]}: is no picture whose size can be read")
-    intrinsics = settings.intrinsics(size_px)
+    paths = picture_paths(images)
+    intrinsics = settings.intrinsics(picture_header(paths[0]).size_px)
     up = vertical(field, settings.up)
     registration = FieldRegistration(field, intrinsics, up, tell)
     written: list[WrittenPicture] = []

@@ -236,7 +236,8 @@ def compared(
     """Pass pictures through, and append the PSNR of each against what the camera saw there."""
     for viewpoint, rgb in pictures:
         if viewpoint.seen is not None:
-            psnr_db.append(psnr(rgb, viewpoint.seen.read()))
+            seen = viewpoint.seen
+            psnr_db.append(psnr(rgb, seen.read(), mask=seen.read_mask()))
         yield viewpoint, rgb
 
 

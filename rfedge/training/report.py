@@ -50,7 +50,7 @@ def _strips(field: RadianceField, held_out: Dataset) -> list[dict[str, Any]]:
     colours = [field.render_colour(picture.camera) for picture in held_out.pictures]
     renders = [rgb_from_colour(colour) for colour in colours]
     quality_db = [
-        psnr(render, picture.read())
+        psnr(render, picture.read(), mask=picture.read_mask())
         for render, picture in zip(renders, held_out.pictures, strict=True)
     ]
     order = np.argsort(quality_db)[::-1].tolist()

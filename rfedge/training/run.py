@@ -19,7 +19,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -30,7 +30,6 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.place import FITS_DB
 from rfcore.files import write_whole
-from rfcore.image import Rgb
 from rfcore.ngp.shape import FEATURES
 from rfcore.train.ngp import NgpModel, NgpTrainer, NgpTrainingConfig
 from rfcore.train.poses import PoseCorrection, align_pictures
@@ -405,11 +404,21 @@ def _in_memory(pictures: Sequence[PosedPicture]) -> list[PosedPicture]:
     """Return the pictures already read, since they are measured on many times."""
     if not pictures:
         raise InvalidInput("held_out", "holds no pictures to measure on")
-    return [replace(picture, read=partial(_identity, picture.read())) for picture in pictures]
+    return [
+        replace(
+            picture,
+            read=partial(_identity, picture.read()),
+            mask=None if picture.mask is None else partial(_identity, picture.mask()),
+        )
+        for picture in pictures
+    ]
 
 
-def _identity(rgb: Rgb) -> Rgb:
-    return rgb
+Values = TypeVar("Values")
+
+
+def _identity(array: Values) -> Values:
+    return array
 
 
 REFINEMENT = ("median_m", "p95_m", "median_deg", "p95_deg")

@@ -79,6 +79,8 @@ def _points_of(picture: PosedPicture, path: Path, count: int) -> PointCloud:
     if depth_m.shape != rgb.shape[:2]:
         raise DatasetError(f"{path}: {depth_m.shape} pixels, the picture has {rgb.shape[:2]}")
     step_px = max(1, isqrt(depth_m.size // max(count, 1)))
+    if (mask := picture.read_mask()) is not None:
+        depth_m = np.where(mask, depth_m, np.float32(0))
     return points_from_depth(picture.camera, rgb, depth_m, step_px)
 
 

@@ -1,17 +1,20 @@
 """The size of a picture is read from its header, and no name leaves the dataset's folder."""
 
+import zlib
+
 import cv2
 import numpy as np
 import pytest
 
 from rfcore.camera import Intrinsics
 from rfcore.dataset.picture_file import (
-    check_size,
+    PictureFile,
     find_picture,
     inside,
-    picture_size_px,
+    picture_paths,
     read_picture,
 )
+from rfcore.dataset.picture_header import picture_header
 from rfcore.errors import DatasetError
 
 RGB = np.random.default_rng(2).integers(0, 256, (31, 77, 3), dtype=np.uint8)
@@ -29,19 +32,24 @@ RGB = np.random.default_rng(2).integers(0, 256, (31, 77, 3), dtype=np.uint8)
 )
 def test_the_header_says_how_large_a_picture_is(name, options, tmp_path):
     assert cv2.imwrite(str(tmp_path / name), RGB, options)
-    assert picture_size_px(tmp_path / name) == (77, 31)
+    assert picture_header(tmp_path / name).size_px == (77, 31)
 
 
-def test_other_formats_are_measured_when_they_are_read(tmp_path):
-    assert cv2.imwrite(str(tmp_path / "a.bmp"), RGB)
-    assert picture_size_px(tmp_path / "a.bmp") is None
+@pytest.mark.parametrize("suffix", [".bmp", ".tif", ".jp2", ".ppm", ".avif"])
+def test_other_formats_are_decoded_for_their_size_and_known_by_content(suffix, tmp_path):
+    path = tmp_path / "a.png"
+    assert cv2.imwrite(str(tmp_path / f"b{suffix}"), RGB)
+    (tmp_path / f"b{suffix}").rename(path)
+    assert picture_header(path).size_px == (77, 31)
+    assert picture_paths(tmp_path) == [path]
+    assert read_picture(path, Intrinsics(77, 31, 9, 9, 4, 3)).shape == RGB.shape
 
 
 def test_a_hostile_size_is_refused_unread(tmp_path):
     header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (30_000).to_bytes(4) * 2
     (tmp_path / "huge.png").write_bytes(header)
     with pytest.raises(DatasetError, match=r"huge\.png: picture is 30000x30000 px, over.*8192"):
-        check_size(tmp_path / "huge.png", Intrinsics(8, 6, 9, 9, 4, 3))
+        PictureFile.of(tmp_path / "huge.png", Intrinsics(8, 6, 9, 9, 4, 3))
 
 
 def test_a_name_without_suffix_finds_its_picture(tmp_path):
@@ -81,3 +89,103 @@ def test_a_picture_longer_than_its_pixels_can_be_is_refused_unread(tmp_path):
         file.truncate(1 << 40)
     with pytest.raises(DatasetError, match="1099511627776 bytes are too many for 77x31 px"):
         read_picture(path, k)
+
+
+def with_exif(path, number, big_endian=False):
+    """Put an EXIF orientation into a JPEG, PNG or WebP file."""
+    order, ends = (b"MM", "big") if big_endian else (b"II", "little")
+    word = lambda value, size: value.to_bytes(size, ends)  # noqa: E731
+    entry = word(0x0112, 2) + word(3, 2) + word(1, 4) + word(number, 2) + bytes(2)
+    exif = order + word(42, 2) + word(8, 4) + word(1, 2) + entry + bytes(4)
+    content = path.read_bytes()
+    if content.startswith(b"\xff\xd8"):
+        data = b"Exif\0\0" + exif
+        segment = b"\xff\xe1" + (len(data) + 2).to_bytes(2, "big") + data
+        path.write_bytes(content[:2] + segment + content[2:])
+    elif content.startswith(b"\x89PNG"):
+        chunk = b"eXIf" + exif
+        crc = zlib.crc32(chunk).to_bytes(4, "big")
+        path.write_bytes(content[:33] + len(exif).to_bytes(4, "big") + chunk + crc + content[33:])
+    else:
+        image = content[12:]
+        header = b"VP8X" + (10).to_bytes(4, "little") + bytes([8, 0, 0, 0])
+        header += (76).to_bytes(3, "little") + (30).to_bytes(3, "little")
+        body = b"WEBP" + header + image + b"EXIF" + len(exif).to_bytes(4, "little") + exif
+        path.write_bytes(b"RIFF" + len(body).to_bytes(4, "little") + body)
+    return path
+
+
+@pytest.mark.parametrize("number", range(1, 9))
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp"])
+def test_exif_turns_a_picture_where_its_camera_is_of_the_turned_one(name, number, tmp_path):
+    path = tmp_path / name
+    assert cv2.imwrite(str(path), RGB, [cv2.IMWRITE_WEBP_QUALITY, 101])
+    stored = read_picture(path, Intrinsics(77, 31, 9, 9, 4, 3))
+    with_exif(path, number, big_endian=number % 2 == 0)
+    assert picture_header(path).orientation == number
+    upright = PictureFile.of(path, Intrinsics(77, 31, 9, 9, 4, 3))
+    assert np.array_equal(upright.read(), stored)
+    assert [note.startswith("are not ") for note in upright.notes] == [True] * (number > 1)
+    turned_camera = Intrinsics(31, 77, 9, 9, 4, 3)
+    if number < 5:
+        with pytest.raises(DatasetError, match="picture is 77x31 px, its camera says 31x77"):
+            PictureFile.of(path, turned_camera)
+        return
+    turned = PictureFile.of(path, turned_camera)
+    oracle = {5: cv2.transpose, 6: lambda a: cv2.rotate(a, cv2.ROTATE_90_CLOCKWISE)}
+    oracle[7] = lambda a: cv2.rotate(cv2.transpose(a), cv2.ROTATE_180)
+    oracle[8] = lambda a: cv2.rotate(a, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    assert np.array_equal(turned.read(), oracle[number](stored))
+    assert turned.notes[0].startswith("are ")
+
+
+@pytest.mark.parametrize("content", [b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", b"\xff\x0a\0\0"])
+def test_formats_that_are_not_read_are_named_with_what_to_do(content, tmp_path):
+    (tmp_path / "IMG_1.HEIC").write_bytes(content)
+    with pytest.raises(DatasetError, match="not read; export them as JPEG or PNG"):
+        picture_paths(tmp_path)
+
+
+MASKED = np.zeros((31, 77), bool)
+MASKED[5:20, 10:40] = True
+
+
+@pytest.mark.parametrize(
+    ("picture", "mask", "white_hides"),
+    [
+        ("images/a.jpg", "masks/a.jpg.png", False),
+        ("images/a.jpg", "masks/a.png", False),
+        ("images/left/a.jpg", "masks/left/a.png", False),
+        ("images/a.jpg", "images/dynamic_mask_a.png", True),
+    ],
+)
+@pytest.mark.parametrize("white", [255, 1])
+def test_a_mask_beside_a_picture_is_found(picture, mask, white_hides, white, tmp_path):
+    for name in (picture, mask):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(tmp_path / picture), RGB)
+    is_white = MASKED if white_hides else ~MASKED
+    cv2.imwrite(str(tmp_path / mask), np.where(is_white, white, 0).astype(np.uint8))
+    opened = PictureFile.of(tmp_path / picture, Intrinsics(77, 31, 9, 9, 4, 3))
+    assert np.array_equal(opened.mask(), ~MASKED)
+    assert opened.notes == ("have a mask: what it hides is not learnt or measured",)
+    assert picture_paths((tmp_path / picture).parent) == [tmp_path / picture]
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path):
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), RGB)
+    cv2.imwrite(str(tmp_path / "masks" / "a.png"), RGB[:20, :20])
+    opened = PictureFile.of(tmp_path / "images" / "a.png", Intrinsics(77, 31, 9, 9, 4, 3))
+    with pytest.raises(DatasetError, match=r"masks/a\.png: mask is 20x20 px, its picture 77x31"):
+        opened.mask()
+
+
+def test_transparent_pixels_do_not_count(tmp_path):
+    rgba = np.dstack([RGB, np.where(MASKED, 0, 255).astype(np.uint8)])
+    cv2.imwrite(str(tmp_path / "a.png"), rgba)
+    opened = PictureFile.of(tmp_path / "a.png", Intrinsics(77, 31, 9, 9, 4, 3))
+    assert np.array_equal(opened.mask(), ~MASKED)
+    assert not opened.read()[MASKED].any()
+    assert "have an alpha channel" in opened.notes[0]

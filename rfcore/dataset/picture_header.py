@@ -1,0 +1,198 @@
+"""What the start of a picture file says: its format, size, alpha, orientation and colours.
+
+Formats are told by content (PNG, W3C; JPEG, ITU-T T.81; WebP, RFC 9649; EXIF, CIPA DC-008). Of
+others FFmpeg decodes the picture for it. So a picture of a hostile size is refused without
+allocating it, and a wrong size is found before a long run starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+from rfcore.dataset.orientation import Orientation
+from rfcore.errors import DatasetError
+from rfcore.image import read_frame
+from rfcore.pixels import has_alpha, treatment
+
+SIGNATURES = {
+    b"\x89PNG\r\n\x1a\n": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+    b"BM": "BMP",
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"v/1\x01": "OpenEXR",
+    b"#?RADIANCE": "Radiance HDR",
+    b"\0\0\0\x0cjP  ": "JPEG 2000",
+    b"\xff\x4f\xff\x51": "JPEG 2000",
+    b"\xff\x0a": "JPEG XL",
+    b"\0\0\0\x0cJXL ": "JPEG XL",
+    b"qoif": "QOI",
+    b"P5": "PGM",
+    b"P6": "PPM",
+}
+UNREAD = ("JPEG XL", "HEIC")
+HEIC = (b"heic", b"heix", b"heim", b"heis", b"mif1")
+START_BYTES = 32
+EXIF_START = b"Exif\0\0"
+ORIENTATION_TAG = 0x0112
+MAX_CHUNKS = 1000
+LINEAR_GAMMA, PQ, HLG = 100_000, 16, 18
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+JPEG_BARE = frozenset(range(0xD0, 0xD9)) | {0x01}
+
+
+@dataclass(frozen=True)
+class PictureHeader:
+    """``size_px`` is (width, height) as stored. ``treatment`` says what is done to its colours."""
+
+    format: str
+    size_px: tuple[int, int]
+    has_alpha: bool = False
+    orientation: Orientation = Orientation.UPRIGHT
+    treatment: str | None = None
+
+
+def picture_format(path: Path) -> str | None:
+    """Return the name of a picture's format, told by its content; ``None`` for another file."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(START_BYTES)
+    except OSError:
+        return None
+    if start[:4] == b"RIFF" and start[8:12] == b"WEBP":
+        return "WebP"
+    if start[4:8] == b"ftyp":
+        if start[8:12] == b"avif":
+            return "AVIF"
+        return "HEIC" if start[8:12] in HEIC else None
+    return next((name for sign, name in SIGNATURES.items() if start.startswith(sign)), None)
+
+
+def picture_header(path: Path) -> PictureHeader:
+    """Return what the file says; raise ``DatasetError`` naming it for one that is no picture."""
+    found = picture_format(path)
+    if found in UNREAD:
+        raise DatasetError(f"{path}: {found} is not read; export the picture as JPEG or PNG")
+    try:
+        with path.open("rb") as file:
+            header = {"PNG": _png, "JPEG": _jpeg, "WebP": _webp}.get(found or "", _none)(file)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from error
+    if header is not None:
+        return header
+    frame = read_frame(path)
+    size_px = (frame.width, frame.height)
+    return PictureHeader(
+        found or "picture", size_px, has_alpha(frame.format), treatment=treatment(frame)
+    )
+
+
+def _none(_: BinaryIO) -> None:
+    return None
+
+
+def _png(file: BinaryIO) -> PictureHeader | None:
+    chunks = dict(_chunks(file, 8))
+    start = chunks.get(b"IHDR", b"")
+    if len(start) < 10:
+        return None
+    said = None
+    if int.from_bytes(chunks.get(b"gAMA", b"")) == LINEAR_GAMMA:
+        said = "linear"
+    coding = chunks.get(b"cICP", b"\0\0")[1:2]
+    said = {bytes([PQ]): "PQ", bytes([HLG]): "HLG"}.get(coding, said)
+    return PictureHeader(
+        "PNG",
+        (int.from_bytes(start[:4]), int.from_bytes(start[4:8])),
+        start[9] in (4, 6) or b"tRNS" in chunks,
+        _orientation(chunks.get(b"eXIf", b"")),
+        said,
+    )
+
+
+def _chunks(file: BinaryIO, at: int) -> Iterator[tuple[bytes, bytes]]:
+    """Yield PNG's chunks before the pixels, of each at most 64 KB."""
+    for _ in range(MAX_CHUNKS):
+        file.seek(at)
+        head = file.read(8)
+        if len(head) < 8 or head[4:] == b"IDAT":
+            return
+        length = int.from_bytes(head[:4])
+        yield head[4:], file.read(min(length, 1 << 16))
+        at += length + 12
+
+
+def _jpeg(file: BinaryIO) -> PictureHeader | None:
+    orientation = Orientation.UPRIGHT
+    for marker in jpeg_segments(file):
+        if marker == 0xE1:
+            length = int.from_bytes(file.read(2)) - 2
+            data = file.read(max(length, 0))
+            if data.startswith(EXIF_START):
+                orientation = _orientation(data[len(EXIF_START) :])
+        if marker in JPEG_FRAMES:
+            start = file.read(7)
+            size_px = (int.from_bytes(start[5:7]), int.from_bytes(start[3:5]))
+            return PictureHeader("JPEG", size_px, orientation=orientation)
+    return None
+
+
+def jpeg_segments(file: BinaryIO) -> Iterator[int]:
+    """Yield the markers from the start, the file behind each; for ``JPEG_BARE`` nothing follows."""
+    file.seek(2)
+    while len(marker := file.read(2)) == 2 and marker[0] == 0xFF:
+        if marker[1] == 0xFF:
+            file.seek(-1, 1)
+            continue
+        at = file.tell()
+        yield marker[1]
+        file.seek(at)
+        if marker[1] not in JPEG_BARE:
+            file.seek(max(int.from_bytes(file.read(2)) - 2, 0), 1)
+
+
+def _webp(file: BinaryIO) -> PictureHeader | None:
+    start = file.read(START_BYTES)
+    kind = start[12:16]
+    if kind == b"VP8X":
+        size_px = tuple(int.from_bytes(start[i : i + 3], "little") + 1 for i in (24, 27))
+        exif = _webp_exif(file) if start[20] & 0x08 else b""
+        alpha = bool(start[20] & 0x10)
+        return PictureHeader("WebP", (size_px[0], size_px[1]), alpha, _orientation(exif))
+    if kind == b"VP8L":
+        bits = int.from_bytes(start[21:25], "little")
+        size_px = ((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
+        return PictureHeader("WebP", size_px, bool(bits >> 28 & 1))
+    if kind == b"VP8 ":
+        width, height = (int.from_bytes(start[i : i + 2], "little") & 0x3FFF for i in (26, 28))
+        return PictureHeader("WebP", (width, height))
+    return None
+
+
+def _webp_exif(file: BinaryIO) -> bytes:
+    at = 12
+    for _ in range(MAX_CHUNKS):
+        file.seek(at)
+        head = file.read(8)
+        length = int.from_bytes(head[4:], "little")
+        if len(head) < 8 or head[:4] == b"EXIF":
+            return file.read(min(length, 1 << 16)).removeprefix(EXIF_START)
+        at += 8 + length + length % 2
+    return b""
+
+
+def _orientation(exif: bytes) -> Orientation:
+    """Return the orientation of a TIFF header with its first directory; upright without one."""
+    if exif[:2] not in (b"II", b"MM"):
+        return Orientation.UPRIGHT
+    ends: Literal["little", "big"] = "little" if exif[:2] == b"II" else "big"
+    at = int.from_bytes(exif[4:8], ends)
+    for entry in range(int.from_bytes(exif[at : at + 2], ends)):
+        field = exif[at + 2 + 12 * entry : at + 14 + 12 * entry]
+        if int.from_bytes(field[:2], ends) == ORIENTATION_TAG:
+            number = int.from_bytes(field[8:10], ends)
+            return Orientation(number) if 1 <= number <= 8 else Orientation.UPRIGHT
+    return Orientation.UPRIGHT
