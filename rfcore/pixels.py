@@ -23,7 +23,7 @@ from typing import Any
 import av
 import numpy as np
 from av.error import FFmpegError
-from av.video.reformatter import ColorTrc, Interpolation
+from av.video.reformatter import ColorRange, ColorTrc, Interpolation
 from numpy.typing import NDArray
 
 from rfcore.errors import DatasetError
@@ -79,10 +79,14 @@ def pixels_of(frame: av.VideoFrame, source: str, matrix: int | None = None) -> P
     else:
         levels, white = _integers(frame, source, matrix, is_as_shown=is_as_shown)
     rgb = levels[..., :3]
-    rgb = _rounded(rgb) if is_as_shown else _as_srgb(rgb, white, transfer, frame.color_primaries)
+    rgb = (
+        _rounded(rgb, white)
+        if is_as_shown
+        else _as_srgb(rgb, white, transfer, frame.color_primaries)
+    )
     if levels.shape[2] == 3:
         return Pixels(np.ascontiguousarray(rgb, np.uint8))
-    alpha = _rounded(levels[..., 3])
+    alpha = _rounded(levels[..., 3], white)
     if not is_float:  # OpenEXR's colours are multiplied by alpha already
         rgb = (rgb.astype(np.uint16) * alpha[..., None] + 127) // 255
     return Pixels(np.ascontiguousarray(rgb, np.uint8), alpha >= OPAQUE)
@@ -134,15 +138,19 @@ def _integers(
 ) -> tuple[Levels, int]:
     """Return 8 or 16 bits [H, W, C] of other frames, and the level of white.
 
-    swscale dithers RGB of 16 bits, but not YUV; its 16 bits of YUV have white at 255 * 256.
+    swscale dithers RGB of 16 bits, but not YUV. Its 16 bits of YUV are YUV's bits, shifted, so
+    that full range of more than 8 bits, which it converts as if it were shifted too, goes this way.
     """
     parts, with_alpha = frame.format.components, has_alpha(frame.format)
+    bits, is_full = max(part.bits for part in parts), frame.color_range == ColorRange.JPEG
     height, width = frame.height, frame.width
     to, white = ("rgba" if with_alpha else "rgb24"), 255
     if any(part.is_chroma and not frame.format.is_rgb for part in parts):
-        if not is_as_shown:
+        if not is_as_shown or (is_full and bits > 8):
             to, white = ("gbrap16le" if with_alpha else "gbrp16le"), 65280
-    elif max(part.bits for part in parts) > 8:
+            if is_full:
+                white = (1 << 16) - (1 << 16 - bits)
+    elif bits > 8:
         to, white = ("rgba64le" if with_alpha else "rgb48le"), 65535
     chroma = (frame.format.chroma_width(width), frame.format.chroma_height(height))
     try:
@@ -173,11 +181,13 @@ def _of_even_sides(frame: av.VideoFrame) -> av.VideoFrame:
     return even
 
 
-def _rounded(levels: Levels) -> NDArray[np.uint8]:
-    """Return 8 or 16 bits as 8, rounded to nearest."""
-    if levels.dtype == np.uint8:
+def _rounded(levels: Levels, white: int) -> NDArray[np.uint8]:
+    """Return levels up to ``white`` as 8 bits, rounded to nearest."""
+    if white == 255:
         return np.asarray(levels, np.uint8)
-    return np.asarray((levels.astype(np.uint32) + 128) // 257, np.uint8)
+    return np.asarray(
+        np.minimum((levels.astype(np.uint32) * 255 + white // 2) // white, 255), np.uint8
+    )
 
 
 def _as_srgb(levels: Levels, white: int, transfer: int, primaries: int) -> NDArray[np.uint8]:

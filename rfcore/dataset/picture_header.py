@@ -97,7 +97,7 @@ def _none(_: BinaryIO) -> None:
 def _png(file: BinaryIO) -> PictureHeader | None:
     chunks = dict(_chunks(file, 8))
     start = chunks.get(b"IHDR", b"")
-    if len(start) < 10:
+    if len(start) < 8:
         return None
     said = None
     if int.from_bytes(chunks.get(b"gAMA", b"")) == LINEAR_GAMMA:
@@ -107,7 +107,7 @@ def _png(file: BinaryIO) -> PictureHeader | None:
     return PictureHeader(
         "PNG",
         (int.from_bytes(start[:4]), int.from_bytes(start[4:8])),
-        start[9] in (4, 6) or b"tRNS" in chunks,
+        start[9:10] in (b"\4", b"\6") or b"tRNS" in chunks,
         _orientation(chunks.get(b"eXIf", b"")),
         said,
     )

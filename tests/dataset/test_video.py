@@ -74,12 +74,20 @@ def shown(rgb: np.ndarray) -> float:
     return (rgb[20:44, 4:28].mean() - 40) / 6
 
 
+class Videos:
+    """A video of each container, written when it is asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __truediv__(self, name: str) -> Path:
+        path = self._folder / name
+        return path if path.exists() else write_video(path, *WRITTEN[name])
+
+
 @pytest.fixture(scope="module")
-def videos(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("videos")
-    for name, (kind, codec) in WRITTEN.items():
-        write_video(folder / name, kind, codec)
-    return folder
+def videos(tmp_path_factory) -> Videos:
+    return Videos(tmp_path_factory.mktemp("videos"))
 
 
 @pytest.mark.parametrize("name", WRITTEN)
