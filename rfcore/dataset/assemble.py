@@ -125,8 +125,8 @@ class Dataset:
     they increase. ``points`` is ``None`` when the dataset has none. ``changed`` has the names of
     pictures by what reading does to them, ``notes`` what was chosen, a line each. ``sorted_out``
     counts those that are listed but were deleted as blurred (``rfcore.dataset.read``).
-    ``exposure_varies`` is true where the dataset says that every picture has an exposure of its own. ``anchor`` says
-    where on the Earth the tile's axes are, if the dataset does.
+    ``exposure_varies`` is true where the dataset says that every picture has an exposure of its
+    own. ``anchor`` says where on the Earth the tile's axes are, if the dataset does.
     """
 
     pictures: tuple[PosedPicture, ...]
