@@ -1,5 +1,6 @@
 """A converted dataset shows the same world as the one it was made from."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -80,3 +81,20 @@ def test_a_size_is_width_x_height(text):
     assert parse_size("640x360") == (640, 360)
     with pytest.raises(InvalidInput, match="size: "):
         parse_size(text)
+
+
+def test_masks_are_kept_and_hide_what_comes_from_a_hidden_pixel(distorted, tmp_path):
+    mask = np.full((48, 64, 3), 255, np.uint8)
+    mask[10:20, 30:40] = 0
+    write_png(distorted / "m.png", mask)
+    content = json.loads((distorted / "transforms.json").read_text())
+    content["frames"][1]["mask_path"] = "m.png"
+    (distorted / "transforms.json").write_text(json.dumps(content))
+    text = convert_dataset(distorted, tmp_path / "out", (32, 24))
+    assert "1 of 4 pictures have a mask: what it hides is not learnt or measured" in text
+    plain = read_dataset(tmp_path / "out").pictures
+    given = read_dataset(distorted, distortion="undistort", size_px=(32, 24)).pictures
+    assert [picture.mask is not None for picture in plain] == [False, True, False, False]
+    assert np.array_equal(plain[1].read_mask(), given[1].read_mask())
+    assert not plain[1].read_mask()[6:9, 16:19].any()
+    assert plain[1].read_mask()[:4].all()

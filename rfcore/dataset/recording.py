@@ -248,8 +248,7 @@ def _video_pictures(where: str, folder: Path, keys: Table, camera: SourceCamera)
 
 def _folder_pictures(where: str, folder: Path, keys: Table, camera: SourceCamera) -> TimedPictures:
     pictures = inside(where, folder, keys.text("folder"))
-    with blamed_on(where):
-        paths = picture_paths(pictures)
+    paths = picture_paths(pictures)
     times_ns = _folder_times_ns(where, folder, keys, len(paths))
     opened = [PictureFile.of(path, camera.intrinsics) for path in paths]
     timed = [

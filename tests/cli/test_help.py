@@ -175,7 +175,7 @@ def test_the_help_loads_nothing_heavy():
         (("train", TRAIN_VIEWS, "--out", "f.rff", "--report", "r.html"), "add --holdout 8"),
         (("dataset", "convert", "nowhere", "--out", "o"), "nowhere"),
         (("dataset", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),
-        (("dataset", "poses", "nowhere", "--out", "o"), "nowhere: holds 0 pictures"),
+        (("dataset", "poses", "nowhere", "--out", "o"), "nowhere: holds no pictures"),
         (("dataset", "record-carla", "--out", "o", "--cameras", "top"), "'top' is none of"),
         (
             ("dataset", "record-carla", "--out", "o", "--port", "1", "--timeout-s", "1"),

@@ -263,7 +263,7 @@ FAULTS: dict[str, list[tuple[str, Fault, str]]] = {
         ("video", edit_text("camera.toml", "fx_px", "k1 = 0.0\n#"), r"\[camera\]: key 'fx_px' is"),
         ("folder", edit_text("camera.toml", "rate_hz", "#"), r"\[pictures\]: .*either 'rate_hz'"),
         ("folder", edit_text("camera.toml", "= 10", "= 0"), r"\[pictures\]: key 'rate_hz' is 0"),
-        ("folder", edit_text("camera.toml", '"frames"', '"."'), r"folder .* holds no pictures"),
+        ("folder", edit_text("camera.toml", '"frames"', '"."'), r"d: holds no pictures"),
         ("folder", edit_text("camera.toml", "rate_hz", "every = 1.5\nrate_hz"), r"'every' is 1\.5"),
         (
             "folder",

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from docs.pages import ROOT
 from rfcore.camera import Intrinsics
 from rfcore.dataset.picture_file import (
     PictureFile,
@@ -14,7 +15,8 @@ from rfcore.dataset.picture_file import (
     picture_paths,
     read_picture,
 )
-from rfcore.dataset.picture_header import picture_header
+from rfcore.dataset.picture_header import SIGNATURES, UNREAD, picture_header
+from rfcore.dataset.video import CONTAINERS
 from rfcore.errors import DatasetError
 
 RGB = np.random.default_rng(2).integers(0, 256, (31, 77, 3), dtype=np.uint8)
@@ -189,3 +191,20 @@ def test_transparent_pixels_do_not_count(tmp_path):
     assert np.array_equal(opened.mask(), ~MASKED)
     assert not opened.read()[MASKED].any()
     assert "have an alpha channel" in opened.notes[0]
+
+
+def test_a_png_of_linear_light_gets_the_curve_of_srgb(tmp_path):
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.full((31, 77, 3), 128, np.uint8))
+    content, chunk = path.read_bytes(), b"gAMA" + (100_000).to_bytes(4, "big")
+    crc = zlib.crc32(chunk).to_bytes(4, "big")
+    path.write_bytes(content[:33] + (4).to_bytes(4, "big") + chunk + crc + content[33:])
+    opened = PictureFile.of(path, Intrinsics(77, 31, 9, 9, 4, 3))
+    assert opened.notes == ("are linear and become sRGB",)
+    assert np.unique(opened.read()).tolist() == [188]
+
+
+def test_the_page_names_every_format():
+    page = (ROOT / "docs" / "reference" / "media.md").read_text()
+    names = [*SIGNATURES.values(), *UNREAD, *", ".join(CONTAINERS.values()).split(", ")]
+    assert [name for name in names if name not in page] == []

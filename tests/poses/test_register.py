@@ -196,7 +196,7 @@ def test_parameters_belong_to_their_model():
 
 
 def test_too_few_pictures_are_refused(tmp_path):
-    with pytest.raises(DatasetError, match="holds 0 pictures"):
+    with pytest.raises(DatasetError, match="holds no pictures"):
         pose_dataset(tmp_path, tmp_path / "out", None, SETTINGS, lambda _: None)
 
 
