@@ -192,7 +192,11 @@ def main() -> None:
     newest = NewestFrame()
     Thread(target=_decode, args=(settings, newest), daemon=True).start()
     while isinstance(taken := newest.take(), Decoded):
-        rgb = rgb_from_video_frame(taken.frame, "the source")
+        try:
+            rgb = rgb_from_video_frame(taken.frame, "the source")
+        except RfedgeError as error:
+            taken = EndRecord(str(error))
+            break
         times = (taken.pts_ns, taken.received_ns, taken.sender_ns)
         record = FrameRecord(rgb, *times, newest.dropped, newest.damaged)
         _write(record.header(), rgb.data)

@@ -125,6 +125,20 @@ def test_what_is_no_video_is_said_in_words(video: Path) -> None:
     assert "Invalid data" in end.problem
 
 
+def test_colours_that_are_not_read_are_said_in_words(video: Path) -> None:
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = *SIZE_PX, "yuv420p"
+        stream.codec_context.colorspace = 8
+        frame = av.VideoFrame(*SIZE_PX, "yuv420p")
+        frame.colorspace, frame.pts, frame.time_base = 8, 0, Fraction(1, 10)
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    frames, end = read_all(settings_of(video), 10.0)
+    assert not frames
+    assert "colour matrix 8 of ITU-T H.273 is not read" in end.problem
+
+
 def test_frames_get_the_poses_of_their_times_and_the_drive_ends(video: Path) -> None:
     events = Events()
     live = opened(video, events)
