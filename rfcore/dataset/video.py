@@ -66,7 +66,7 @@ def open_video(file: Path) -> InputContainer:
     try:
         container = av.open(str(file.absolute()), options={"format_whitelist": WHITELIST})
         if not container.streams.video:
-            raise DatasetError(f"{file}: holds no video")
+            raise DatasetError(f"{file}: not a readable video (there is none in it)")
         codec = container.streams.video[0].codec_context
         if isinstance(codec, VideoCodecContext):
             codec.thread_type = "AUTO"
