@@ -231,6 +231,7 @@ class SliceEffort:
         intra_reach: int,
         halves_reach: int,
         shapes_reach: int,
+        whole_trials: int,
         cost_rounds: int,
     ) -> None: ...
 

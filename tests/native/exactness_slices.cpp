@@ -3,7 +3,7 @@
 //
 // usage: exactness_slices ISA THREADS SCENE RESULT
 //
-// SCENE: int32 width, height, references, qp, effort[7], deblocked; uint32 lambda_q8[52], motion_q8[52]; int8
+// SCENE: int32 width, height, references, qp, effort[8], deblocked; uint32 lambda_q8[52], motion_q8[52]; int8
 // quantiser of every macroblock; bytes Y, U, V of the picture, then of every reference.
 // RESULT: slice data; bytes Y, U, V of the reconstruction.
 #include <algorithm>
@@ -40,13 +40,13 @@ struct Planes {
 
 void run(const char* isa, int threads, const char* scene, const char* result) {
     File in(scene, "rb"), out(result, "wb");
-    const auto header = in.read<std::int32_t>(12);
+    const auto header = in.read<std::int32_t>(13);
     const int width = header[0], height = header[1], references = header[2];
     SliceCoder coder(width, height, kernels_for(isa), threads);
     SliceSettings settings = {};
     settings.slice_qp = header[3];
-    settings.effort = {header[4], header[5], header[6], header[7], header[8], header[9], header[10]};
-    settings.deblocked = header[11] != 0;
+    settings.effort = {header[4], header[5], header[6], header[7], header[8], header[9], header[10], header[11]};
+    settings.deblocked = header[12] != 0;
     const auto weights = in.read<std::uint32_t>(104);
     std::copy_n(weights.data(), 52, settings.lambda_q8);
     std::copy_n(weights.data() + 52, 52, settings.motion_q8);

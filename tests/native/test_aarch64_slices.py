@@ -58,7 +58,7 @@ def test_aarch64_codes_a_picture_to_the_same_bytes(
         reconstruction.planes,
         np.empty(MACROBLOCKS, np.int8),
     )
-    scene = struct.pack("<12i", *SIZE, references, qp, *effort.value, True)
+    scene = struct.pack("<13i", *SIZE, references, qp, *effort.value, True)
     scene += LAMBDA_Q8.tobytes() + MOTION_Q8.tobytes() + quantisers.tobytes()
     scene += b"".join(picture.packed() for picture in (frame, *others))
     there = emulated("exactness_slices", isa, 1, scene)

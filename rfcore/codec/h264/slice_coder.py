@@ -40,10 +40,10 @@ LAMBDA_FACTOR = 0.59
 """Lambda at QP 12: the squared error that one bit is worth. It doubles every 3 steps of the
 quantiser. 0.68 takes 0.25 % more bits for the same squared error (a street with vehicles, 640x360),
 and so does 0.53."""
-MOTION_FACTOR = 1.4
+MOTION_FACTOR = 1.2
 """Factor on the root of lambda for motion search, where a difference is a sum of absolute transform
-coefficients. A factor of 1.8 takes 0.1 to 1 % more bits and 3 % less time (default effort; most at
-30 Hz and high quantisers)."""
+coefficients. A factor of 1.4 takes 0.3 to 0.8 % more bits (streets with and without a field, a real
+one, rain), 1.8 another 0.5."""
 MAX_QP = 60
 """Highest QP. Beyond 51 only lambda grows, by up to eight times, until little is left to code."""
 _P_SLICE, _I_SLICE = 0, 2
@@ -68,6 +68,8 @@ class Trials(NamedTuple):
     """
     shapes_reach: int
     """Partitions that cost at most this many percent of the cheapest are coded as well."""
+    whole_trials: int
+    """1: 16x16 is coded with the predicted vector, too; 2: also with the second best reference."""
     cost_rounds: int
     """Rounds of moving vectors by a quarter sample wherever the coded macroblock then costs
     less."""
@@ -77,7 +79,8 @@ class Effort(Enum):
     """The number of choices that the coder tries.
 
     The default leaves out references that cost 18 % more than the best: 10 % less time for at most
-    0.2 % more bits. The two rounds of ``THOROUGH`` nearly double its time and save 1.9 to 2.3 %.
+    0.2 % more bits. The predicted vector for 16x16 takes 8 % more instructions and saves up to
+    0.9 %, 2 % in rain. ``THOROUGH`` nearly doubles the time and saves 2 to 4 %.
     """
 
     FAST = Trials(
@@ -87,6 +90,7 @@ class Effort(Enum):
         intra_reach=5,
         halves_reach=101,
         shapes_reach=100,
+        whole_trials=0,
         cost_rounds=0,
     )
     DEFAULT = Trials(
@@ -96,6 +100,7 @@ class Effort(Enum):
         intra_reach=7,
         halves_reach=104,
         shapes_reach=100,
+        whole_trials=1,
         cost_rounds=0,
     )
     THOROUGH = Trials(
@@ -105,6 +110,7 @@ class Effort(Enum):
         intra_reach=0,
         halves_reach=0,
         shapes_reach=103,
+        whole_trials=2,
         cost_rounds=2,
     )
 

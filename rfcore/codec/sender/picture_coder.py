@@ -206,6 +206,10 @@ def _zone(first: int, last: int, options: Mapping[str, str]) -> str:
 QP_OF_CRF = 6.5
 """Median of the QP at which our coder's squared error is x264's, less the CRF: 6.2 on the empty
 sample drive, 6.8 on the one with vehicles, from CRF 15 to 40."""
+INTRA_FINER = 2.0
+"""How much finer a frame without references is coded, since later ones are predicted from it. Clips
+of 24 frames without a field take 0.1 % fewer bits in all, and from the second frame on 1 % (x264's
+CRF codes the first one 6 finer)."""
 
 
 @dataclass(frozen=True)
@@ -253,10 +257,11 @@ class _OwnPictureCoder:
 
     def code(self, frame: I420, references: Sequence[I420], request: CodingRequest) -> CodedPicture:
         _require_coder(request.effort, Coder.OWN)
+        qp = request.crf + QP_OF_CRF
         coded = self._coder.encode(
             frame,
             references,
-            request.crf + QP_OF_CRF,
+            qp if references else qp - INTRA_FINER,
             effort=Effort[request.effort.upper()],
             offsets=None if request.qp_map is None else request.qp_map.offsets.ravel(),
         )

@@ -108,13 +108,14 @@ void bind_h264(nb::module_& m) {
     nb::class_<Effort>(m, "SliceEffort")
         .def("__init__",
              [](Effort* made, int search_steps, int subsample_steps, int references_reach,
-                int intra_reach, int halves_reach, int shapes_reach, int cost_rounds) {
+                int intra_reach, int halves_reach, int shapes_reach, int whole_trials,
+                int cost_rounds) {
                  new (made) Effort{search_steps, subsample_steps, references_reach, intra_reach,
-                                   halves_reach, shapes_reach, cost_rounds};
+                                   halves_reach, shapes_reach, whole_trials, cost_rounds};
              },
              nb::kw_only(), nb::arg("search_steps"), nb::arg("subsample_steps"),
              nb::arg("references_reach"), nb::arg("intra_reach"), nb::arg("halves_reach"),
-             nb::arg("shapes_reach"), nb::arg("cost_rounds"));
+             nb::arg("shapes_reach"), nb::arg("whole_trials"), nb::arg("cost_rounds"));
     nb::class_<LockedCoder>(m, "SliceCoder")
         .def(nb::init<int, int, const std::string&, int>(), nb::arg("width"), nb::arg("height"),
              nb::arg("isa"), nb::arg("threads") = 1)

@@ -19,6 +19,11 @@ constexpr uint32_t kWholeBits = 100;
 // residual is made.
 constexpr uint32_t kSkipBits = 100;
 
+// What the plainest intra macroblock takes, in bits. Where inter prediction costs less, it is not
+// tried. Trying it wherever prediction leaves nothing to code, but errors, saves 1 to 1.8 % of the
+// bits, in rain 8 %, and takes 15 % more instructions.
+constexpr uint32_t kIntraBits = 8;
+
 // What an I_PCM macroblock takes in 1/256 bits: samples, type, alignment and the coder's new start.
 constexpr uint32_t kPcmBits = 256 * (8 * 384 + 16);
 // Added to the cost of a candidate of another mode than the forced one.
@@ -321,12 +326,12 @@ private:
         order(best, second);
         inter_cost_ = whole[best].cost;
         code_whole(best, whole[best].mv);
-        if (job_.effort.cost_rounds > 0) {
+        if (job_.effort.whole_trials > 0) {
             const Mv predicted = predicted_vector(field_, 0, kPartitions[0][0], best);
             const bool differs = !(whole[best].mv == predicted);
             if (differs && range_.holds(predicted)) code_whole(best, predicted);
-            if (second != best) code_whole(second, whole[second].mv);
         }
+        if (job_.effort.whole_trials > 1 && second != best) code_whole(second, whole[second].mv);
         if (free() && best_->mb.kind == Kind::kInter && best_->mb.cbp_luma == 0) return;
         if (free() && inter_cost_ < kWholeBits * motion_q8_) return;
         try_parts(whole);
@@ -463,7 +468,12 @@ private:
     // --- intra ---
 
     bool wants_intra() {
-        return free() && (job_.effort.intra_reach == 0 || best_->mb.cbp_luma != 0);
+        return free() && best_->cost > quality_.cost(0, 256 * kIntraBits);
+    }
+
+    // Inter prediction leaves no luma to code: smaller blocks, each with its mode, would not pay.
+    bool wants_whole_intra() const {
+        return free() && best_ != nullptr && best_->mb.cbp_luma == 0;
     }
 
     bool beyond_reach(uint32_t difference) const {
@@ -488,14 +498,16 @@ private:
             }
         }
         if (best_ != nullptr && beyond_reach(lowest)) return;
+        const bool whole = wants_whole_intra();
         Candidate& c = spare();
         start(c, Kind::kIntra16);
         c.mb.intra16_mode = static_cast<uint8_t>(mode16);
         intra_chroma(c);
-        if (best_ == nullptr || worth_16(lowest)) {
+        if (best_ == nullptr || whole || worth_16(lowest)) {
             code_luma16(quality_, source_[0], least, c);
             weigh(c);
         }
+        if (whole) return;
         // c may have become the best; the chroma of all three kinds is the same.
         Candidate& next = &c == best_ ? spare() : c;
         if (&next != &c) copy_chroma(c, next);

@@ -73,9 +73,10 @@ struct Effort {
                            // the whole; 0: always
     int shapes_reach;      // partitions are coded, too, that cost at most this many percent of the
                            // cheapest; at least 100
+    int whole_trials;      // 16x16 is coded with the predicted vector, too (1), and with the
+                           // second best reference (2)
     int cost_rounds;       // in which vectors are moved by a quarter sample, each time coding the
-                           // macroblock; with any, 16x16 is coded with the predicted vector and
-                           // with the second best reference, too
+                           // macroblock
 };
 
 struct SliceJob {
