@@ -87,6 +87,11 @@ def spent(resource: Resource) -> str:
     return f"rfedge_server_spent_total{{{resource}}}"
 
 
+def poses(result: str) -> str:
+    """Return the counter of poses ahead of their frames; the bystander sends none."""
+    return f"rfedge_server_poses_ahead_total{{{result}}}"
+
+
 def lost(cause: LossCause) -> str:
     """Return the counter of decoder processes that ended in use."""
     return f"rfedge_server_decoders_lost_total{{{cause}}}"
@@ -122,10 +127,10 @@ ATTACKS = {
         Attack("vehicle", rpcs.revoked, REFUSED_CERTIFICATES),
         Attack("vehicle", packets.flipped_slices, spent(Resource.MESSAGES)),
         Attack("vehicle", packets.hung_decoders, lost(LossCause.TIMEOUT)),
-        Attack("vehicle", packets.poses_for_nothing, spent(Resource.MESSAGES), NO_CAPACITY),
-        Attack("vehicle", packets.poses_of_large_renders, spent(Resource.MESSAGES), NO_CAPACITY),
-        Attack("vehicle", packets.poses_of_other_places, spent(Resource.MESSAGES), NO_CAPACITY),
-        Attack("vehicle", packets.junk_poses, spent(Resource.MESSAGES)),
+        Attack("vehicle", packets.poses_for_nothing, poses("taken"), NO_CAPACITY),
+        Attack("vehicle", packets.poses_of_large_renders, poses("taken"), NO_CAPACITY),
+        Attack("vehicle", packets.poses_of_other_places, poses("taken"), NO_CAPACITY),
+        Attack("vehicle", packets.junk_poses, poses("refused")),
         Attack("none", connections.strangers, PROCESSOR_S),
         Attack("none", connections.silent_connections, DEFERRED),
         Attack("none", connections.half_requests, OPEN_FILES),
