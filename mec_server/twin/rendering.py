@@ -24,7 +24,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mec_server.event_loop import Workers, give_way, work_when_idle
+from mec_server.event_loop import Workers, give_way
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
 from mec_server.twin.state import Covers, ReceivedPicture, Twin
@@ -63,6 +63,10 @@ Classify = Callable[[Rgb], str]
 """A detector: returns the name of the object in a cut-out of a picture, uint8 [H, W, 3]: at most 64
 letters, digits, '.', '_' or '-', or nothing."""
 
+VIEWS_NICE = 19
+"""Niceness of the thread that draws views. Not SCHED_IDLE: on a busy machine its thread would be
+stopped for seconds while it holds the interpreter's lock, and the whole server with it.
+"""
 FINDING_NICE = 5
 """Niceness of the thread that finds objects, which are worth nothing when they are late: at 10 it
 found none for seconds where others kept the processors busy."""
@@ -220,7 +224,7 @@ class ViewService:
         self._classify = classify
         self._tiles = tiles
         self._ledger = ledger
-        views = Workers(1, failed, "views", begin=work_when_idle)
+        views = Workers(1, failed, "views", begin=partial(give_way, VIEWS_NICE))
         objects = Workers(1, failed, "objects", begin=partial(give_way, FINDING_NICE))
         self._composing = _FieldThread(views, open_fields())
         self._finding = _FieldThread(objects, open_fields())
