@@ -27,8 +27,9 @@ from rfcore.pixels import EXACT_CONVERSION, Pixels, pixels_of
 Rgb = NDArray[np.uint8]
 Plane = NDArray[np.uint8]
 
+DISPLAY_P3, SRGB_TRANSFER = 12, 13
 UNSPECIFIED_MATRIX = 2
-"""ITU-T H.273, MatrixCoefficients."""
+"""ITU-T H.273's codes."""
 HD_LINES = 720
 
 JPEG_QUANTISER = "3"
@@ -150,9 +151,15 @@ def read_rgb(path: Path) -> Rgb:
     return read_pixels(path).rgb
 
 
-def read_pixels(path: Path) -> Pixels:
-    """Read a picture file with what is opaque of it; raise as ``read_rgb``."""
-    return pixels_of(read_frame(path), str(path))
+def read_pixels(path: Path, *, is_p3: bool = False) -> Pixels:
+    """Read a picture file with what is opaque of it; raise as ``read_rgb``.
+
+    ``is_p3``: its profile, which FFmpeg does not read, is Display P3.
+    """
+    frame = read_frame(path)
+    if is_p3:
+        frame.color_primaries, frame.color_trc = DISPLAY_P3, SRGB_TRANSFER
+    return pixels_of(frame, str(path))
 
 
 def rgb_from_bytes(data: bytes, source: str) -> Rgb:

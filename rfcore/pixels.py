@@ -7,8 +7,8 @@ Every picture and video frame passes here; nothing else decides what its numbers
 * **HLG and PQ** (ITU-R BT.2100) become BT.709 as a BT.1886 display (gamma 2.4) shows it. Their
   reference white, 203 cd/m2 (ITU-R BT.2408), is white and what is brighter too. HLG's system gamma
   1.2 is applied to each channel, as FFmpeg's zscale does.
-* **BT.2020 and P3 primaries** become BT.709's. Other transfers are taken as they are, as displays
-  and browsers do with BT.709 and sRGB.
+* **BT.2020 and P3 primaries** become BT.709's, by the transfer that goes with them. Other transfers
+  are taken as they are, as displays and browsers do with BT.709 and sRGB.
 * **More than 8 bits** are rounded to nearest, without dither.
 * **Chroma** is interpolated linearly. swscale does that at even sizes only, so odd ones get one
   column or row more for it.
@@ -195,7 +195,8 @@ def _as_srgb(levels: Levels, white: int, transfer: int, primaries: int) -> NDArr
     light = _light_of(transfer, white)[levels]
     if primaries in WIDE:
         light = light @ _to_bt709(primaries).T
-    return _coded(transfer == ColorTrc.LINEAR)[_sixteen_bits(light)]
+    is_srgb = transfer in (ColorTrc.LINEAR, ColorTrc.IEC61966_2_1)
+    return _coded(is_srgb)[_sixteen_bits(light)]
 
 
 def _sixteen_bits(light: F32) -> NDArray[np.uint16]:
@@ -214,6 +215,8 @@ def _light_of(transfer: int, white: int) -> F32:
         a, b, c = 0.17883277, 0.28466892, 0.55991073
         scene = np.where(code <= 0.5, code**2 / 3, (np.exp((code - c) / a) + b) / 12)
         light = scene**1.2 * 1000 / WHITE_CD_M2
+    elif transfer == ColorTrc.IEC61966_2_1:
+        light = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
     else:
         light = code if transfer == ColorTrc.LINEAR else code**2.4
     return light.astype(np.float32)

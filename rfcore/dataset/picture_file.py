@@ -18,7 +18,14 @@ import numpy as np
 
 from rfcore.camera import MAX_SIDE_PX, Intrinsics
 from rfcore.dataset.orientation import Orientation
-from rfcore.dataset.picture_header import UNREAD, jpeg_segments, picture_format, picture_header
+from rfcore.dataset.picture_header import (
+    OTHER_PROFILE,
+    P3,
+    UNREAD,
+    jpeg_segments,
+    picture_format,
+    picture_header,
+)
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, read_pixels
 from rfcore.pixels import Pixels
@@ -80,6 +87,7 @@ class PictureFile:
     intrinsics: Intrinsics
     orientation: Orientation
     has_alpha: bool
+    is_p3: bool
     mask_file: MaskFile | None
     notes: tuple[str, ...]
 
@@ -103,6 +111,8 @@ class PictureFile:
                 )
         if header.treatment is not None:
             notes.append(f"are {header.treatment} and become sRGB")
+        if header.profile == OTHER_PROFILE:
+            notes.append("have a colour profile that is not read: they are taken as sRGB")
         if header.has_alpha:
             notes.append(
                 "have an alpha channel: they are composed over black, and what is transparent is "
@@ -111,7 +121,10 @@ class PictureFile:
         mask = mask or mask_beside(path)
         if mask is not None:
             notes.append("have a mask: what it hides is not learnt or measured")
-        return PictureFile(path, intrinsics, orientation, header.has_alpha, mask, tuple(notes))
+        is_p3 = header.profile == P3
+        return PictureFile(
+            path, intrinsics, orientation, header.has_alpha, is_p3, mask, tuple(notes)
+        )
 
     @property
     def mask(self) -> Callable[[], Mask] | None:
@@ -126,7 +139,7 @@ class PictureFile:
         PictureFile.of(self.path, self.intrinsics, self.mask_file)  # it may have been replaced
         _require_length(self.path, self.intrinsics)
         _require_whole_jpeg(self.path)
-        pixels = read_pixels(self.path)
+        pixels = read_pixels(self.path, is_p3=self.is_p3)
         height, width, _ = pixels.rgb.shape
         require_size(self.path, self.orientation.size((width, height)), self.intrinsics)
         return pixels
@@ -177,7 +190,7 @@ def mask_beside(path: Path) -> MaskFile | None:
         return None
     for folder in path.parents[:3]:
         masks = folder.parent / "masks" / path.parent.relative_to(folder)
-        for name in (f"{path.name}.png", f"{path.stem}.png", path.name):
+        for name in (f"{path.name}.png", *(path.stem + suffix for suffix in SUFFIXES)):
             if masks.is_dir() and (masks / name).is_file():
                 return MaskFile(masks / name)
     return None

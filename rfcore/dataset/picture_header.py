@@ -7,7 +7,9 @@ allocating it, and a wrong size is found before a long run starts.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -39,6 +41,8 @@ START_BYTES = 32
 EXIF_START = b"Exif\0\0"
 ORIENTATION_TAG = 0x0112
 MAX_CHUNKS = 1000
+P3, OTHER_PROFILE = "Display P3", "other"
+MAX_PROFILE_BYTES = 1 << 16
 LINEAR_GAMMA, PQ, HLG = 100_000, 16, 18
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset(range(0xD0, 0xD9)) | {0x01}
@@ -53,6 +57,8 @@ class PictureHeader:
     has_alpha: bool = False
     orientation: Orientation = Orientation.UPRIGHT
     treatment: str | None = None
+    profile: str | None = None
+    """``P3``, ``OTHER_PROFILE``, or ``None`` for sRGB and where there is none."""
 
 
 def picture_format(path: Path) -> str | None:
@@ -104,12 +110,15 @@ def _png(file: BinaryIO) -> PictureHeader | None:
         said = "linear"
     coding = chunks.get(b"cICP", b"\0\0")[1:2]
     said = {bytes([PQ]): "PQ", bytes([HLG]): "HLG"}.get(coding, said)
+    name, _, data = chunks.get(b"iCCP", b"").partition(b"\0")
+    with suppress(zlib.error):
+        name += zlib.decompressobj().decompress(data[1:], MAX_PROFILE_BYTES)
     return PictureHeader(
         "PNG",
         (int.from_bytes(start[:4]), int.from_bytes(start[4:8])),
         start[9:10] in (b"\4", b"\6") or b"tRNS" in chunks,
         _orientation(chunks.get(b"eXIf", b"")),
-        said,
+        *_profiled(said, name),
     )
 
 
@@ -121,22 +130,24 @@ def _chunks(file: BinaryIO, at: int) -> Iterator[tuple[bytes, bytes]]:
         if len(head) < 8 or head[4:] == b"IDAT":
             return
         length = int.from_bytes(head[:4])
-        yield head[4:], file.read(min(length, 1 << 16))
+        yield head[4:], file.read(min(length, MAX_PROFILE_BYTES))
         at += length + 12
 
 
 def _jpeg(file: BinaryIO) -> PictureHeader | None:
-    orientation = Orientation.UPRIGHT
+    orientation, profile = Orientation.UPRIGHT, b""
     for marker in jpeg_segments(file):
-        if marker == 0xE1:
+        if marker in (0xE1, 0xE2):
             length = int.from_bytes(file.read(2)) - 2
             data = file.read(max(length, 0))
+            if data.startswith(b"ICC_PROFILE\0"):
+                profile += data
             if data.startswith(EXIF_START):
                 orientation = _orientation(data[len(EXIF_START) :])
         if marker in JPEG_FRAMES:
             start = file.read(7)
             size_px = (int.from_bytes(start[5:7]), int.from_bytes(start[3:5]))
-            return PictureHeader("JPEG", size_px, orientation=orientation)
+            return PictureHeader("JPEG", size_px, False, orientation, *_profiled(None, profile))
     return None
 
 
@@ -159,9 +170,12 @@ def _webp(file: BinaryIO) -> PictureHeader | None:
     kind = start[12:16]
     if kind == b"VP8X":
         size_px = tuple(int.from_bytes(start[i : i + 3], "little") + 1 for i in (24, 27))
-        exif = _webp_exif(file) if start[20] & 0x08 else b""
-        alpha = bool(start[20] & 0x10)
-        return PictureHeader("WebP", (size_px[0], size_px[1]), alpha, _orientation(exif))
+        exif = _webp_chunk(file, b"EXIF").removeprefix(EXIF_START) if start[20] & 0x08 else b""
+        profile = _webp_chunk(file, b"ICCP") if start[20] & 0x20 else b""
+        alpha, orientation = bool(start[20] & 0x10), _orientation(exif)
+        return PictureHeader(
+            "WebP", (size_px[0], size_px[1]), alpha, orientation, *_profiled(None, profile)
+        )
     if kind == b"VP8L":
         bits = int.from_bytes(start[21:25], "little")
         size_px = ((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
@@ -172,16 +186,26 @@ def _webp(file: BinaryIO) -> PictureHeader | None:
     return None
 
 
-def _webp_exif(file: BinaryIO) -> bytes:
+def _webp_chunk(file: BinaryIO, name: bytes) -> bytes:
     at = 12
     for _ in range(MAX_CHUNKS):
         file.seek(at)
         head = file.read(8)
         length = int.from_bytes(head[4:], "little")
-        if len(head) < 8 or head[:4] == b"EXIF":
-            return file.read(min(length, 1 << 16)).removeprefix(EXIF_START)
+        if len(head) < 8 or head[:4] == name:
+            return file.read(min(length, MAX_PROFILE_BYTES))
         at += 8 + length + length % 2
     return b""
+
+
+def _profiled(treatment: str | None, profile: bytes) -> tuple[str | None, str | None]:
+    """Return what is done to the colours, and what an ICC profile's text says that it is."""
+    text = profile.replace(b"\0", b"")
+    if not text or b"sRGB" in text:
+        return treatment, None
+    if b"Display P3" in text:
+        return treatment or "in Display P3", P3
+    return treatment, OTHER_PROFILE
 
 
 def _orientation(exif: bytes) -> Orientation:

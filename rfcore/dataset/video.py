@@ -34,7 +34,7 @@ from rfcore.camera import MAX_SIDE_PX
 from rfcore.dataset.orientation import Orientation
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, rgb_from_video_frame
-from rfcore.pixels import HDR, treatment
+from rfcore.pixels import HDR, has_alpha, treatment
 
 CONTAINERS = {
     "mov": "MP4, MOV, 3GP",
@@ -227,6 +227,9 @@ def _index(file: Path) -> VideoIndex:
         seekable = is_stated and container.format.name.split(",")[0] in SOUGHT
         orientation = _orientation(file, first)
         notes = _notes(first, orientation)
+        aspect = stream.sample_aspect_ratio
+        if aspect and aspect != 1:
+            notes.append(f"pixels are {float(aspect):.4g} times as wide as high: taken as stored")
         if not is_stated:
             rate = _rate_hz(file, stream)
             notes.append(f"frames state no times in order: {float(rate):g} a second are taken")
@@ -304,6 +307,8 @@ def _notes(frame: av.VideoFrame, orientation: Orientation) -> list[str]:
     if (said := treatment(frame)) is not None:
         white = "; white is 203 cd/m2, and what is brighter" if said in HDR.values() else ""
         notes.append(f"{said} becomes BT.709{white}")
+    if has_alpha(frame.format):
+        notes.append("frames have an alpha channel: they are composed over black")
     if frame.interlaced_frame:
         notes.append("frames are marked as interlaced: what moves may show two times, line by line")
     return notes

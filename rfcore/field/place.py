@@ -45,7 +45,7 @@ def check_place(
     compared = spread(pictures, PAIRS)
     renders = [rgb_from_colour(field.render_colour(p.camera)) for p in compared]
     pairs = zip(renders, compared, strict=True)
-    fit_db = float(np.mean([psnr(render, picture.read()) for render, picture in pairs]))
+    fit_db = float(np.mean([psnr(rgb, p.read(), mask=p.read_mask()) for rgb, p in pairs]))
     if fit_db >= FITS_DB:
         return None
     return (

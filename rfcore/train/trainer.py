@@ -309,9 +309,12 @@ def mean_colour_db(shown: Sequence[PosedPicture], seen: Sequence[PosedPicture]) 
     """Return the mean PSNR of ``seen`` against the mean colour of ``shown`` everywhere: what knows
     nothing of a place has."""
     colour = np.mean([picture.read().mean(axis=(0, 1)) / 255.0 for picture in shown], axis=0)
-    pictures = [picture.read() / 255.0 for picture in seen]
-    flat = [np.broadcast_to(colour, rgb.shape) for rgb in pictures]
-    return float(np.mean([psnr(*pair, peak=1.0) for pair in zip(flat, pictures, strict=True)]))
+    values_db = []
+    for picture in seen:
+        rgb = picture.read() / 255.0
+        flat = np.broadcast_to(colour, rgb.shape)
+        values_db.append(psnr(flat, rgb, peak=1.0, mask=picture.read_mask()))
+    return float(np.mean(values_db))
 
 
 def _check(pictures: Sequence[PosedPicture]) -> None:

@@ -208,3 +208,56 @@ def test_the_page_names_every_format():
     page = (ROOT / "docs" / "reference" / "media.md").read_text()
     names = [*SIGNATURES.values(), *UNREAD, *", ".join(CONTAINERS.values()).split(", ")]
     assert [name for name in names if name not in page] == []
+
+
+def p3_of(rgb):
+    """Code sRGB for Display P3: the matrix of CSS Color 4."""
+    light = np.where(rgb / 255 <= 0.04045, rgb / 255 / 12.92, ((rgb / 255 + 0.055) / 1.055) ** 2.4)
+    to_p3 = np.array(
+        [[0.822462, 0.177538, 0], [0.033194, 0.966806, 0], [0.017083, 0.072397, 0.91052]]
+    )
+    light = light @ to_p3.T
+    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.round(255 * code).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp"])
+@pytest.mark.parametrize("profile", [b"Display P3", b"Adobe RGB", b"sRGB IEC61966"])
+def test_pictures_of_phones_in_display_p3_become_srgb(name, profile, tmp_path):
+    rgb = np.kron(RGB[:4, :10], np.ones((8, 8, 1), np.uint8))[:31, :77]
+    path, wide = tmp_path / name, b"\0" + b"".join(bytes([0, c]) for c in profile)
+    stored = p3_of(rgb) if profile == b"Display P3" else rgb
+    quality = (
+        [cv2.IMWRITE_WEBP_QUALITY, 101] if name == "a.webp" else [cv2.IMWRITE_JPEG_QUALITY, 100]
+    )
+    sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    cv2.imwrite(
+        str(path),
+        stored[..., ::-1],
+        quality + sampling if name == "a.jpg" else [*quality] * (name == "a.webp"),
+    )
+    content = path.read_bytes()
+    if name == "a.png":
+        chunk = b"iCCPx\0\0" + zlib.compress(wide)
+        crc = zlib.crc32(chunk).to_bytes(4, "big")
+        size = (len(chunk) - 4).to_bytes(4, "big")
+        path.write_bytes(content[:33] + size + chunk + crc + content[33:])
+    elif name == "a.jpg":
+        data = b"ICC_PROFILE\0\1\1" + wide
+        segment = b"\xff\xe2" + (len(data) + 2).to_bytes(2, "big") + data
+        path.write_bytes(content[:2] + segment + content[2:])
+    else:
+        data = wide + b"\0" * (len(wide) % 2)
+        header = b"VP8X" + (10).to_bytes(4, "little") + bytes([0x20, 0, 0, 0])
+        header += (76).to_bytes(3, "little") + (30).to_bytes(3, "little")
+        body = b"WEBP" + header + b"ICCP" + len(data).to_bytes(4, "little") + data + content[12:]
+        path.write_bytes(b"RIFF" + len(body).to_bytes(4, "little") + body)
+    opened = PictureFile.of(path, Intrinsics(77, 31, 9, 9, 4, 3))
+    off = np.abs(opened.read().astype(int) - rgb)
+    assert off.max() <= (9 if profile == b"Display P3" else 3)
+    assert off.mean() < 0.7
+    said = {
+        b"Display P3": ("are in Display P3 and become sRGB",),
+        b"Adobe RGB": ("have a colour profile that is not read: they are taken as sRGB",),
+    }
+    assert opened.notes == said.get(profile, ())
