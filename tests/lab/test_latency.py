@@ -9,6 +9,7 @@ from rich.console import Console
 
 from lab.latency import EvalLatency
 from lab.latency.run import (
+    AHEAD_BYTES,
     FRAMES_FOR_REQUIREMENT,
     REQUIREMENT,
     needed_rate_bps,
@@ -160,14 +161,32 @@ def test_what_both_ends_compute_is_told_stage_by_stage(latency):
 def test_from_capture_to_shown_takes_longer_than_the_link_alone(latency):
     _, result = latency
     rows = {(row["method"], row["link"]): row for row in result["rows"]}
-    assert len(result["shown"]) == len(rows)
-    for shown in result["shown"]:
-        played = rows[shown["method"], shown["link"]]
+    alone = [row for row in result["shown"] if not row["pose_ahead"]]
+    assert {(row["method"], row["link"]) for row in alone} >= rows.keys()
+    for shown in alone:
+        assert 0 < shown["sender_busy_percent"] < 100
+        played = rows.get((shown["method"], shown["link"]))
+        if played is None:  # a link that the frames alone are not played over
+            continue
         assert shown["frames"] == played["frames"]
         assert (shown["width_px"], shown["height_px"]) == (96, 64)
-        assert 0 < shown["sender_busy_percent"] < 100
         if shown["dropped"] == played["dropped"] == 0:
             assert shown["sent_ms"]["mean"] > played["network_ms"]["mean"]
+
+
+def test_with_the_pose_ahead_no_frame_is_shown_later(latency):
+    _, result = latency
+    ours = {row["method"] for row in result["shown"] if row["pose_ahead"]}
+    rows = {
+        (row["link"], row["pose_ahead"]): row for row in result["shown"] if row["method"] in ours
+    }
+    links = {link for link, _ in rows}
+    assert len(rows) == 2 * len(links)
+    for link in links:
+        if rows[link, True]["dropped"] == rows[link, False]["dropped"] == 0:
+            pose_ms = 8e3 * AHEAD_BYTES / rows[link, True]["rate_bps"]
+            waited_ms = rows[link, False]["shown_p50_ms"]
+            assert rows[link, True]["shown_p50_ms"] <= waited_ms + 2 * pose_ms
 
 
 @pytest.mark.parametrize(
