@@ -273,6 +273,26 @@ class PredictionChain:
             self._epoch_used = False
         self.base = self._decoded
 
+    def refused(self, nack: Nack) -> None:
+        """Begin an epoch, unless the refusal follows from a loss that began one already."""
+        if nack.address.epoch < self.epoch and nack.current_epoch <= self.epoch:
+            return
+        self.restart(nack.current_epoch)
+
+
+@dataclass
+class SendingCamera:
+    """One camera's prediction chain, and how many frames it may send."""
+
+    chain: PredictionChain
+    granted: int = 0
+    used: int = 0
+
+    @property
+    def may_send(self) -> bool:
+        """Return whether the server's credit allows another frame."""
+        return self.used < self.granted
+
 
 AHEAD_FRAMING_BYTES = 80
 """gRPC, HTTP/2, TLS, TCP and IP around a pose ahead, which is a packet of its own."""

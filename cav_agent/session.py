@@ -36,6 +36,7 @@ from cav_agent.pending_frames import (
     AheadSwitch,
     FramesInFlight,
     PredictionChain,
+    SendingCamera,
     WaitingInstants,
 )
 from cav_agent.rate_control import BitDivision, ByteBudget, RateControl
@@ -80,20 +81,6 @@ class OutgoingMessage:
     data: bytes
     packet_bytes: int = 0
     """Of a frame: with the pose that was sent ahead of it."""
-
-
-@dataclass
-class SendingCamera:
-    """One camera's prediction chain, and how many frames it may send."""
-
-    chain: PredictionChain
-    granted: int = 0
-    used: int = 0
-
-    @property
-    def may_send(self) -> bool:
-        """Return whether the server's credit allows another frame."""
-        return self.used < self.granted
 
 
 class AgentSession:
@@ -262,7 +249,7 @@ class AgentSession:
             for camera in self._cameras.values():
                 camera.chain.restart(nack.current_epoch)
         elif camera_id in self._cameras:
-            _restart_after(nack, self._cameras[camera_id].chain)
+            self._cameras[camera_id].chain.refused(nack)
 
     def _end_refused(self, nack: Nack, now: float) -> None:
         """End the frames that ``nack`` is about; an overloaded server has not judged them."""
@@ -504,10 +491,3 @@ class AgentSession:
             waited_s = self._in_flight.longest_wait_s(now)
             problem = f"no answer to a frame within {waited_s:.2g} s"
             self.broken = StreamEnd(EndReason.NO_ANSWER, problem)
-
-
-def _restart_after(nack: Nack, chain: PredictionChain) -> None:
-    """Begin an epoch, unless the refusal follows from a loss that began one already."""
-    if nack.address.epoch < chain.epoch and nack.current_epoch <= chain.epoch:
-        return
-    chain.restart(nack.current_epoch)

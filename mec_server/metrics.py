@@ -76,6 +76,10 @@ class OpeningResult(StrEnum):
     """The stream was over before its decoders were open."""
 
 
+MAX_AHEAD_S, MAX_BEHIND_S = 1.0, 60.0
+"""A capture time further ahead of the server's clock, or further behind it, is implausible: clocks
+kept by NTP differ by milliseconds, and no frame is delivered after a minute."""
+
 STAGES = tuple(f.name.removesuffix("_ns") for f in fields(StageTimes) if f.name != "total_ns")
 
 
@@ -403,9 +407,19 @@ class VehicleMetrics:
                 labels = (*self._label, "nacked", message.reason)
                 self._metrics.frames.labels(*labels).inc(message.count)
 
-    def reconstructed(self, latency_s: float) -> None:
-        """Observe the age of a picture when it was reconstructed."""
+    def reconstructed(self, captured_ns: int, now_ns: int, since_arrival_s: float) -> float:
+        """Observe the age of a picture when it was reconstructed, and return it.
+
+        Where the time of capture that the frame states is not plausible, that is the time since
+        its arrival: a wrong clock makes no age or sum wrong.
+        """
+        claimed_s = (now_ns - captured_ns) / 1e9
+        if not -MAX_AHEAD_S <= claimed_s <= MAX_BEHIND_S:
+            self._metrics.implausible_captures.inc()
+            return since_arrival_s
+        latency_s = max(0.0, claimed_s)
         self._latency.observe(latency_s)
+        return latency_s
 
     def forget(self) -> None:
         """Note that the stream is over."""

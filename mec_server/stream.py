@@ -56,10 +56,6 @@ from rfcore.wire.tls import peer_identity
 log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[bytes, bytes]
 
-MAX_AHEAD_S, MAX_BEHIND_S = 1.0, 60.0
-"""A capture time further ahead of the server's clock, or further behind it, is implausible: clocks
-kept by NTP differ by milliseconds, and no frame is delivered after a minute."""
-
 UNKNOWN_VEHICLE = ""
 """The vehicle id under which a stream is counted until its Hello is accepted."""
 
@@ -440,24 +436,14 @@ class Stream:
 
     def _reconstructed(self, job: DecodeJob, made: Reconstruction, now: float) -> None:
         self._session.decoded(job, made.digest, made.times, now)
-        latency_s = self._latency_s(job)
+        since_arrival_s = max(0.0, time.monotonic() - job.received_s)
+        latency_s = self._metrics.reconstructed(
+            job.frame.capture_time_ns, time.time_ns(), since_arrival_s
+        )
         if not made.exact:
             self._server.metrics.inexact.inc()
         self._server.metrics.count_picture(job.field_id, len(job.frame.packet.payload))
         self._show(job, made, now, latency_s)
-
-    def _latency_s(self, job: DecodeJob) -> float:
-        """Return the seconds since the capture time that the frame states, if that is plausible.
-
-        Otherwise return those since its arrival: a wrong clock makes no age or sum wrong.
-        """
-        claimed_s = (time.time_ns() - job.frame.capture_time_ns) / 1e9
-        if not -MAX_AHEAD_S <= claimed_s <= MAX_BEHIND_S:
-            self._server.metrics.implausible_captures.inc()
-            return max(0.0, time.monotonic() - job.received_s)
-        latency_s = max(0.0, claimed_s)
-        self._metrics.reconstructed(latency_s)
-        return latency_s
 
     def _rejected(self, job: DecodeJob, error: PacketRejected, worker_s: float, now: float) -> None:
         self._log_rejected(job.frame.address, error)

@@ -47,7 +47,8 @@ def drive(metrics: ServerMetrics, vehicle_id: str, frame: Frame) -> None:
     stream.received(frame, 500)
     stream.answered([Ack(ADDRESS, StageTimes(10**6, 10**7), b"d" * 16)])
     stream.answered([Nack(ADDRESS, RejectReason.SEQUENCE_GAP, "never arrived", count=3)])
-    stream.reconstructed(0.05)
+    assert stream.reconstructed(0, 50_000_000, 0.01) == 0.05
+    assert stream.reconstructed(0, 61 * 10**9, 0.01) == 0.01, "an implausible clock"
 
 
 def test_without_the_flag_no_series_names_a_vehicle(
