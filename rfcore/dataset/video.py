@@ -33,7 +33,7 @@ from av.video.stream import VideoStream
 from rfcore.camera import MAX_SIDE_PX
 from rfcore.dataset.orientation import Orientation
 from rfcore.errors import DatasetError
-from rfcore.image import Rgb, rgb_from_video_frame
+from rfcore.image import MAX_PICTURE_PX, Rgb, rgb_from_video_frame
 from rfcore.pixels import HDR, has_alpha, treatment
 
 CONTAINERS = {
@@ -70,6 +70,7 @@ def open_video(file: Path) -> InputContainer:
         codec = container.streams.video[0].codec_context
         if isinstance(codec, VideoCodecContext):
             codec.thread_type = "AUTO"
+            codec.options = {"max_pixels": str(MAX_PICTURE_PX)}
     except (FFmpegError, OSError, ValueError) as error:
         raise DatasetError(f"{file}: not a readable video ({error})") from error
     return container
@@ -208,6 +209,7 @@ def _index(file: Path) -> VideoIndex:
         stream = container.streams.video[0]
         if stream.codec_context is None:
             raise DatasetError(f"{file}: is of a codec that is not known")
+        _check_side(file, stream.codec_context.width, stream.codec_context.height)
         if container.format.name.startswith("mov"):
             _require_whole_boxes(file)
         try:
@@ -239,11 +241,15 @@ def _index(file: Path) -> VideoIndex:
     )
 
 
-def _check_frame(file: Path, number: int, frame: av.VideoFrame, first: av.VideoFrame) -> None:
-    if max(frame.width, frame.height) > MAX_SIDE_PX:
+def _check_side(file: Path, width: int, height: int) -> None:
+    if max(width, height) > MAX_SIDE_PX:
         raise DatasetError(
-            f"{file}: video is {frame.width}x{frame.height} px, over the limit of {MAX_SIDE_PX} px"
+            f"{file}: video is {width}x{height} px, over the limit of {MAX_SIDE_PX} px"
         )
+
+
+def _check_frame(file: Path, number: int, frame: av.VideoFrame, first: av.VideoFrame) -> None:
+    _check_side(file, frame.width, frame.height)
     if (frame.width, frame.height) != (first.width, first.height):
         raise DatasetError(
             f"{file}: frame {number} is {frame.width}x{frame.height} px, the first one "

@@ -193,6 +193,29 @@ def test_a_broadcast_that_begins_between_key_frames_starts_at_the_next_one(video
     assert video.index.times_ns[0] == 0
 
 
+def test_a_video_of_absurd_size_is_refused_before_it_is_decoded(videos, monkeypatch):
+    monkeypatch.setattr("rfcore.dataset.video.MAX_SIDE_PX", 63)
+    monkeypatch.setattr("rfcore.dataset.video._frames", None)  # none is to get so far
+    with pytest.raises(DatasetError, match=r"a\.mp4: video is 64x48 px, over the limit of 63 px"):
+        Video(videos / "a.mp4")
+
+
+def test_interlaced_frames_and_pixels_that_are_not_square_are_said(tmp_path):
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=RATE)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.options = {"x264-params": "tff=1"}
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        for number in range(3):
+            frame = av.VideoFrame.from_ndarray(picture(number), "rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, RATE)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    notes = " ".join(Video(tmp_path / "a.mp4").index.notes)
+    assert "marked as interlaced" in notes
+    assert "pixels are 1.333 times as wide as high" in notes
+
+
 MATRICES = {
     1: (1, 0, 0, 1),
     2: (-1, 0, 0, 1),
