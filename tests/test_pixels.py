@@ -187,8 +187,20 @@ def test_linear_light_of_an_exr_gets_the_curve_of_srgb(tmp_path):
 def test_an_exr_that_is_not_finite_is_refused(tmp_path):
     light = np.full((8, 8, 3), np.nan, np.float32)
     write_frame(tmp_path / "a.exr", "exr", av.VideoFrame.from_ndarray(light, "gbrpf32le"))
-    with pytest.raises(DatasetError, match=r"a\.exr: has NaN or infinite values"):
+    with pytest.raises(DatasetError, match=r"a\.exr: has NaN or infinite values; save it as sRGB"):
         read_rgb(tmp_path / "a.exr")
+    saved = np.nan_to_num(light * 255).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), saved)
+    assert np.array_equal(read_rgb(tmp_path / "a.png"), saved)
+
+
+def test_what_is_refused_for_its_matrix_is_read_when_it_is_saved_as_rgb(tmp_path):
+    write_video(tmp_path / "a.mkv", "ffv1", [frame_of(96, 64, "yuv420p", 8, full=False)])
+    with pytest.raises(DatasetError, match="save it as sRGB"):
+        from_video(tmp_path / "a.mkv")
+    rgb = av.VideoFrame.from_ndarray(blocks(96, 64), "rgb24").reformat(format="bgr0")
+    write_video(tmp_path / "b.mkv", "ffv1", [rgb])
+    assert np.array_equal(from_video(tmp_path / "b.mkv"), blocks(96, 64))
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.webp"])
