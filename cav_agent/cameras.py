@@ -13,6 +13,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import structlog
+
 from cav_agent.capture_schedule import CaptureSchedule, recorded_schedule
 from cav_agent.config import AgentConfig
 from cav_agent.frames import Capture
@@ -154,7 +156,10 @@ def recorded_cameras(
 def _read_drive(config: AgentConfig, origin: TileOrigin) -> list[PosedPicture]:
     if config.drive is None:
         raise InvalidInput("drive", "is missing")
-    pictures = read_dataset(config.drive, tile_origin=origin).pictures
+    dataset = read_dataset(config.drive, tile_origin=origin)
+    for change in dataset.changes:
+        structlog.get_logger().info("drive read", note=change)
+    pictures = dataset.pictures
     first = pictures[0]
     for picture in pictures:
         if picture.camera.intrinsics != first.camera.intrinsics:

@@ -217,6 +217,10 @@ LATTICE = PoseLattice()
 """Lattice that senders round poses to."""
 
 
+NEAR_M = 10_000.0
+"""float32 positions resolve 1 mm at this distance: nearer to zero, zero is the origin."""
+
+
 @dataclass(frozen=True)
 class TileOrigin:
     """The origin of a tile's local frame in a global metric frame (UTM or ECEF magnitudes)."""
@@ -228,6 +232,13 @@ class TileOrigin:
     def __post_init__(self) -> None:
         if not all(map(math.isfinite, (self.east_m, self.north_m, self.up_m))):
             raise InvalidInput("tile_origin", f"{self} must be finite")
+
+    @classmethod
+    def beside(cls, middle_m: Sequence[float]) -> TileOrigin:
+        """Return zero where ``middle_m`` is near it, else ``middle_m`` in whole metres."""
+        if math.hypot(*middle_m) <= NEAR_M:
+            return cls()
+        return cls(*(float(round(value)) for value in middle_m))
 
     def localise(self, world_from_cam: Pose) -> Pose:
         """Return a global pose relative to this origin (float64 subtraction)."""

@@ -90,8 +90,6 @@ def _averaged(values: NDArray[np.float64], count: int, axis: int) -> NDArray[np.
     return np.asarray(np.diff(at_edges, axis=axis) * (count / size))
 
 
-NEAR_M = 10_000.0
-"""float32 positions resolve 1 mm at this distance: nearer to zero, zero is the origin."""
 MAX_TILE_RADIUS_M = 100_000.0
 """float32 positions resolve 8 mm at this distance from the tile's origin."""
 
@@ -167,7 +165,10 @@ def assemble(source: Source, options: ReadOptions) -> Dataset:
         points=localised(source.points, origin) if source.points is not None else None,
         tile_origin=origin,
         changed=_changed(source.pictures, options.size_px),
-        notes=source.notes,
+        notes=(
+            *source.notes,
+            *([source.points.note] if source.points is not None and source.points.note else []),
+        ),
         sorted_out=source.sorted_out,
         exposure_varies=source.exposure_varies,
         anchor=source.anchor.relative_to(origin) if source.anchor is not None else None,
@@ -264,10 +265,7 @@ def _near(picture: SourcePicture, origin: TileOrigin) -> Pose:
 def chosen_origin(pictures: Sequence[SourcePicture]) -> TileOrigin:
     """Return zero where the cameras are near it, else their median position in whole metres."""
     axes = zip(*(picture.world_from_cam.translation_m for picture in pictures), strict=True)
-    middle = [statistics.median(axis) for axis in axes]
-    if math.hypot(*middle) <= NEAR_M:
-        return TileOrigin()
-    return TileOrigin(*(float(round(value)) for value in middle))
+    return TileOrigin.beside([statistics.median(axis) for axis in axes])
 
 
 def localised(points: SourcePoints, origin: TileOrigin) -> PointCloud:

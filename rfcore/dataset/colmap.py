@@ -1,9 +1,10 @@
 r"""Posed pictures from a COLMAP model and the folder ``images`` it was made from.
 
-The model lies in ``sparse/0``, ``sparse`` or the folder itself, in text or binary form (binary is
-preferred, as in COLMAP). Pictures are in the order of their names. Poses are cam_from_world with
-OpenCV camera axes, quaternions w, x, y, z; pixel centres are at +0.5 as here. Both forms are
-described in COLMAP's documentation, "Output Format".
+The model lies in ``sparse/N``, ``sparse`` or the folder itself, in text or binary form (binary is
+preferred, as in COLMAP). Of several models the one with most pictures is read, which is said.
+Pictures are in the order of their names. Poses are cam_from_world with OpenCV camera axes,
+quaternions w, x, y, z; pixel centres are at +0.5 as here. Both forms are described in COLMAP's
+documentation, "Output Format".
 
 Binary, little-endian (``cameras.bin``, ``images.bin``, ``points3D.bin``)::
 
@@ -19,6 +20,7 @@ An image takes two lines; the second, its 2D points, may be empty and is skipped
 
 from __future__ import annotations
 
+import shlex
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -29,9 +31,10 @@ import numpy as np
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import (
-    LENS_KEYS,
+    LENS_MODELS,
     blamed_on,
     finite_numbers,
+    lens_model,
     lens_of,
     pose_of_quaternion,
     read_file,
@@ -41,19 +44,11 @@ from rfcore.dataset.keys import (
 from rfcore.dataset.picture_file import PictureFile, find_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
 from rfcore.errors import DatasetError
+from rfcore.lens import FisheyeLens
 from rfcore.tables import shortened
 
-MODEL_IDS = {
-    0: "SIMPLE_PINHOLE",
-    1: "PINHOLE",
-    2: "SIMPLE_RADIAL",
-    3: "RADIAL",
-    4: "OPENCV",
-    5: "OPENCV_FISHEYE",
-}
+MODEL_NAMES = {model.number: name for name, model in LENS_MODELS.items()}
 MAX_NAME = 60
-ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-COLMAP_LENS_KEYS = {**LENS_KEYS, "OPENCV": ("k1", "k2", "p1", "p2")}
 
 
 @dataclass(frozen=True)
@@ -75,27 +70,43 @@ class ColmapModel:
     points: SourcePoints | None
 
 
-def parameter_count(where: str, model: object) -> int:
+def parameter_count(where: str, name: object) -> int:
     """Return how many parameters a camera model has; ``DatasetError`` for an unknown one."""
-    if not isinstance(model, str) or model not in COLMAP_LENS_KEYS:
-        raise DatasetError(f"{where}: camera model {model} is none of {', '.join(LENS_KEYS)}")
-    return (3 if model in ONE_FOCAL else 4) + len(COLMAP_LENS_KEYS[model])
+    model = lens_model(where, name)
+    return model.focal_lengths + 2 + len(model.coefficients)
 
 
 def camera_of(
-    where: str, model: str, size_px: tuple[int, int], parameters: Sequence[float]
+    where: str, name: str, size_px: tuple[int, int], parameters: Sequence[float], remedy: str = ""
 ) -> SourceCamera:
-    """Return a camera from its parameters, which are f or fx, fy, then cx, cy, then the lens."""
-    needed = parameter_count(where, model)
+    """Return a camera from its parameters, which are f or fx, fy, then cx, cy, then the lens.
+
+    Raises ``DatasetError`` for a lens that is not read, which ends with ``remedy``.
+    """
+    needed = parameter_count(where, name)
     if len(parameters) != needed:
-        raise DatasetError(f"{where}: {model} has {needed} parameters, not {len(parameters)}")
-    focal = 1 if model in ONE_FOCAL else 2
+        raise DatasetError(f"{where}: {name} has {needed} parameters, not {len(parameters)}")
+    model = LENS_MODELS[name]
+    focal = model.focal_lengths
+    values = dict(zip(model.coefficients, parameters[focal + 2 :], strict=True))
+    lens = lens_of(where, name, table_at(where, values), remedy)
     fx_px, fy_px = parameters[0], parameters[focal - 1]
     cx_px, cy_px = parameters[focal : focal + 2]
-    lens = dict(zip(COLMAP_LENS_KEYS[model], parameters[focal + 2 :], strict=True))
     with blamed_on(where):
-        intrinsics = Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px)
-    return SourceCamera(intrinsics, lens_of(where, model, table_at(where, lens)))
+        return SourceCamera(Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px), lens)
+
+
+def camera_parameters(camera: SourceCamera) -> tuple[str, list[float]]:
+    """Return the name of a camera's model and its parameters; the inverse of ``camera_of``."""
+    k, lens = camera.intrinsics, camera.lens
+    if lens is None:
+        name = "PINHOLE"
+    elif isinstance(lens, FisheyeLens):
+        name = "OPENCV_FISHEYE"
+    else:
+        name = "FULL_OPENCV" if getattr(lens, "k3", 0.0) else "OPENCV"
+    coefficients = [float(getattr(lens, key, 0.0)) for key in LENS_MODELS[name].coefficients]
+    return name, [k.fx_px, k.fy_px, k.cx_px, k.cy_px, *coefficients]
 
 
 def image_of(where: str, name: str, camera_id: int, numbers: Sequence[float]) -> ColmapImage:
@@ -112,10 +123,13 @@ POINT2D_BYTES = 24
 TRACK_BYTES = 8
 
 
-def read_binary_model(folder: Path) -> ColmapModel:
-    """Read a binary model. Raises ``DatasetError`` naming the file and the place in it."""
+def read_binary_model(folder: Path, remedy: str = "") -> ColmapModel:
+    """Read a binary model. Raises ``DatasetError`` naming the file and the place in it.
+
+    An error about a lens ends with ``remedy``.
+    """
     return ColmapModel(
-        cameras=dict(_cameras(_Bytes(folder / "cameras.bin"))),
+        cameras=dict(_cameras(_Bytes(folder / "cameras.bin"), remedy)),
         images=tuple(_images(_Bytes(folder / "images.bin"))),
         points=_points(folder / "points3D.bin"),
     )
@@ -153,14 +167,14 @@ class _Bytes:
             raise DatasetError(f"{self.file}: name {name!r} is not UTF-8") from error
 
 
-def _cameras(content: _Bytes) -> Iterator[tuple[int, SourceCamera]]:
+def _cameras(content: _Bytes, remedy: str) -> Iterator[tuple[int, SourceCamera]]:
     (count,) = content.take("<Q")
     for i in range(count):
         camera_id, model_id, width_px, height_px = content.take("<IiQQ")
         where = f"{content.file}: camera {i}"
-        model = MODEL_IDS.get(model_id, f"number {model_id}")
+        model = MODEL_NAMES.get(model_id, f"number {model_id}")
         parameters = content.take(f"<{parameter_count(where, model)}d")
-        yield camera_id, camera_of(where, model, (width_px, height_px), parameters)
+        yield camera_id, camera_of(where, model, (width_px, height_px), parameters, remedy)
 
 
 def _images(content: _Bytes) -> Iterator[ColmapImage]:
@@ -192,10 +206,10 @@ def _point(content: _Bytes) -> tuple[float, float, float, int, int, int]:
     return (x, y, z, red, green, blue)
 
 
-def read_text_model(folder: Path) -> ColmapModel:
-    """Read a text model. Raises ``DatasetError`` naming the file and the line."""
+def read_text_model(folder: Path, remedy: str = "") -> ColmapModel:
+    """Read a text model as ``read_binary_model`` does; errors name the file and the line."""
     return ColmapModel(
-        cameras=dict(_cameras_of_text(folder / "cameras.txt")),
+        cameras=dict(_cameras_of_text(folder / "cameras.txt", remedy)),
         images=tuple(_images_of_text(folder / "images.txt")),
         points=_points_of_text(folder / "points3D.txt"),
     )
@@ -215,11 +229,11 @@ def _checked(where: str, words: list[str], at_least: int) -> tuple[str, list[str
     return where, words
 
 
-def _cameras_of_text(file: Path) -> Iterator[tuple[int, SourceCamera]]:
+def _cameras_of_text(file: Path, remedy: str) -> Iterator[tuple[int, SourceCamera]]:
     for where, words in _rows(file, 4):
         size_px = (_whole(where, words[2]), _whole(where, words[3]))
         parameters = finite_numbers(where, words[4:])
-        yield _whole(where, words[0]), camera_of(where, words[1], size_px, parameters)
+        yield _whole(where, words[0]), camera_of(where, words[1], size_px, parameters, remedy)
 
 
 def _images_of_text(file: Path) -> Iterator[ColmapImage]:
@@ -251,25 +265,60 @@ def _whole(where: str, word: str) -> int:
     return int(word[:20])
 
 
-def colmap_model_folder(folder: Path) -> Path | None:
-    """Return where a dataset's model lies, ``None`` without one."""
-    for candidate in (folder / "sparse" / "0", folder / "sparse", folder):
-        if any((candidate / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return candidate
-    return None
+def colmap_models(folder: Path) -> list[Path]:
+    """Return where a dataset's models lie: in ``sparse/N``, the one with most pictures first; else
+    in ``sparse`` or the folder itself."""
+    numbered = [path for path in sorted((folder / "sparse").glob("*")) if images_file(path)]
+    if numbered:
+        return sorted(numbered, key=_image_count, reverse=True)
+    return [path for path in (folder / "sparse", folder) if images_file(path)][:1]
 
 
-def read_colmap_source(model_folder: Path) -> Source:
-    """Read a model and find its pictures. Raises ``DatasetError`` naming the file."""
-    binary = (model_folder / "images.bin").is_file()
-    model = read_binary_model(model_folder) if binary else read_text_model(model_folder)
+def images_file(model_folder: Path) -> Path | None:
+    """Return the file that lists a model's images, None without one."""
+    files = (model_folder / name for name in ("images.bin", "images.txt"))
+    return next((file for file in files if file.is_file()), None)
+
+
+def _image_count(model_folder: Path) -> int:
+    """Return how many images a model has, as its file begins; 0 where it is damaged."""
+    file = images_file(model_folder)
+    if file is None:
+        return 0
+    if file.suffix == ".bin":
+        with file.open("rb") as start:
+            return int.from_bytes(start.read(8), "little")
+    lines = [line for line in text_lines(file) if not line.lstrip().startswith("#")]
+    return sum(bool(line.strip()) for line in lines[::2])
+
+
+def read_colmap_source(model_folder: Path, others: Sequence[Path] = ()) -> Source:
+    """Read a model and find its pictures; say that ``others``, which there are, are not read.
+
+    Raises ``DatasetError`` naming the file.
+    """
+    file = images_file(model_folder)
     images_folder = _images_folder(model_folder)
+    read = read_text_model if file is not None and file.suffix == ".txt" else read_binary_model
+    model = read(model_folder, _undistorter(model_folder, images_folder))
     ordered = sorted(model.images, key=lambda image: image.name)
+    notes = []
+    if others:
+        left = ", ".join(f"{other} of {_image_count(other)}" for other in others)
+        notes = [f"{model_folder} is read, of {len(ordered)} pictures; not read: {left}"]
     return Source(
-        file=model_folder / ("images.bin" if binary else "images.txt"),
+        file=file or model_folder / "images.bin",
         pictures=tuple(_picture(model, images_folder, image) for image in ordered),
         points=model.points,
+        notes=tuple(notes),
     )
+
+
+def _undistorter(model_folder: Path, images_folder: Path) -> str:
+    """Return the command that undistorts the pictures of a model into a dataset."""
+    words = ["--image_path", images_folder, "--input_path", model_folder]
+    command = " ".join(shlex.quote(str(word)) for word in words)
+    return f"; undistort them: colmap image_undistorter {command} --output_path undistorted"
 
 
 def _images_folder(model_folder: Path) -> Path:

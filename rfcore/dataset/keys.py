@@ -15,6 +15,7 @@ import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -133,33 +134,79 @@ def filled_lines(file: Path) -> list[tuple[str, str]]:
     return [(f"{file}: line {number}", line) for number, line in lines if line.strip()]
 
 
-LENS_KEYS = {
-    "PINHOLE": (),
-    "SIMPLE_PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+@dataclass(frozen=True)
+class LensModel:
+    """A camera model as COLMAP numbers it, and its coefficients in COLMAP's order.
+
+    ``focal_lengths`` is 1 for fx = fy. ``read`` are the coefficients that a lens here has, those
+    which files that name coefficients may add included; any other must be zero.
+    """
+
+    number: int
+    focal_lengths: int
+    coefficients: tuple[str, ...]
+    read: tuple[str, ...]
+    fisheye: bool = False
+
+    @property
+    def is_read(self) -> bool:
+        """Whether every camera of this model is read, whatever its coefficients."""
+        return set(self.coefficients) <= set(self.read) and self.focal_lengths > 0
+
+
+BROWN, KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
+THIN_PRISM = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
+RAD_TAN = (*(f"k{i}" for i in range(6)), "p0", "p1", *(f"s{i}" for i in range(4)))
+LENS_MODELS = {
+    "PINHOLE": LensModel(1, 2, (), ()),
+    "SIMPLE_PINHOLE": LensModel(0, 1, (), ()),
+    "SIMPLE_RADIAL": LensModel(2, 1, ("k1",), ("k1",)),
+    "RADIAL": LensModel(3, 1, ("k1", "k2"), ("k1", "k2")),
+    "OPENCV": LensModel(4, 2, BROWN[:4], BROWN),
+    "OPENCV_FISHEYE": LensModel(5, 2, KANNALA, KANNALA, fisheye=True),
+    "FULL_OPENCV": LensModel(6, 2, (*BROWN, "k4", "k5", "k6"), BROWN),
+    "FOV": LensModel(7, 2, ("omega",), ()),
+    "SIMPLE_RADIAL_FISHEYE": LensModel(8, 1, ("k1",), ("k1",), fisheye=True),
+    "RADIAL_FISHEYE": LensModel(9, 1, ("k1", "k2"), ("k1", "k2"), fisheye=True),
+    "THIN_PRISM_FISHEYE": LensModel(10, 2, THIN_PRISM, KANNALA, fisheye=True),
+    "RAD_TAN_THIN_PRISM_FISHEYE": LensModel(11, 2, RAD_TAN, (), fisheye=True),
+    "SIMPLE_DIVISION": LensModel(12, 1, ("k",), ()),
+    "DIVISION": LensModel(13, 2, ("k",), ()),
+    "SIMPLE_FISHEYE": LensModel(14, 1, (), (), fisheye=True),
+    "FISHEYE": LensModel(15, 2, (), (), fisheye=True),
+    "EUCM": LensModel(16, 2, ("alpha", "beta"), ()),
+    "EQUIRECTANGULAR": LensModel(17, 0, (), ()),
 }
+"""Camera models of COLMAP 4.2, by the names that nerfstudio shares."""
+READ_MODELS = ", ".join(name for name, model in LENS_MODELS.items() if model.is_read)
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-def lens_of(where: str, model: object, keys: Table) -> Lens | None:
-    """Return the lens, ``None`` for a pinhole."""
-    if not isinstance(model, str) or model not in LENS_KEYS:
-        raise DatasetError(f"{where}: camera_model {model!r} is none of {', '.join(LENS_KEYS)}")
-    given = {key: keys.number(key) for key in DISTORTION_KEYS if key in keys}
-    known = LENS_KEYS[model]
-    for key, value in given.items():
-        if value != 0.0 and key not in known:
-            raise DatasetError(
-                f"{where}: lens distortion {key} = {value:g} does not belong to camera_model "
-                f"{model}, which has {', '.join(known) or 'none'}"
-            )
-    return _lens(model, {key: given.get(key, 0.0) for key in known})
+def lens_model(where: str, name: object) -> LensModel:
+    """Return a camera model by its name; ``DatasetError`` for one that is not known."""
+    if not isinstance(name, str) or name not in LENS_MODELS:
+        raise DatasetError(f"{where}: camera model {name} is none of {READ_MODELS}")
+    return LENS_MODELS[name]
 
 
-def _lens(model: str, coefficients: dict[str, float]) -> Lens | None:
-    if model == "OPENCV_FISHEYE":
+def lens_of(where: str, name: object, keys: Table, remedy: str = "") -> Lens | None:
+    """Return the lens, ``None`` for a pinhole.
+
+    Raises ``DatasetError`` for one that no lens here is, which ends with ``remedy``.
+    """
+    model = lens_model(where, name)
+    given = {
+        key: keys.number(key) for key in (*DISTORTION_KEYS, *model.coefficients) if key in keys
+    }
+    unread = [
+        f"{key} = {value:g}" for key, value in given.items() if value and key not in model.read
+    ]
+    if unread or not model.focal_lengths:
+        raise DatasetError(
+            f"{where}: lens distortion {', '.join(unread) or 'of a sphere'} of camera_model {name} "
+            f"is not read, only {', '.join(model.read) or 'none'}{remedy}"
+        )
+    coefficients = {key: given.get(key, 0.0) for key in model.read}
+    if model.fisheye:
         return FisheyeLens(**coefficients)
     return BrownLens(**coefficients) if any(coefficients.values()) else None

@@ -41,34 +41,59 @@ JPEG_END = b"\xff\xd9"
 
 
 def inside(where: str, folder: Path, name: str) -> Path:
-    """Return ``folder / name``; raise ``DatasetError`` for a name that leaves the folder."""
-    path = PurePosixPath(name)
+    """Return ``folder / name``, where ``name`` may be written for Windows, or absolute.
+
+    An absolute name is of a file in the folder, or in another machine's copy of it: the longest end
+    of it that is there is taken. Raises ``DatasetError`` for a name that leaves the folder.
+    """
+    path = _inside(where, folder, name)
+    if path is None:
+        raise DatasetError(
+            f"{where}: path '{name}' leaves the dataset's folder {folder}, and no end of it is "
+            "there; name files relative to that folder"
+        )
+    return path
+
+
+def _inside(where: str, folder: Path, name: str) -> Path | None:
+    """Return the same, None for an absolute name of which no end is in the folder."""
+    path = PurePosixPath(name.replace("\\", "/"))
     if any(len(part.encode()) > MAX_PART_BYTES for part in path.parts):
         raise DatasetError(f"{where}: path {shortened(name)} is too long")
-    if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
+    if ".." in path.parts or "\0" in name:
         raise DatasetError(f"{where}: path '{name}' leaves the dataset's folder {folder}")
-    return folder / path
+    if not is_absolute(name):
+        return folder / path
+    ends = (folder.joinpath(*path.parts[i:]) for i in range(1, len(path.parts)))
+    return next((end for end in ends if end.exists() or _existing(end) is not None), None)
+
+
+def is_absolute(name: str) -> bool:
+    """Tell whether a name is absolute on Linux or Windows."""
+    return name[:1] in ("/", "\\") or name[1:3] in (":/", ":\\")
 
 
 def find_picture(where: str, folder: Path, name: str) -> Path:
     """Return the file of a picture; raise ``DatasetError`` if it is missing."""
-    path = picture_file(where, folder, name)
+    path = file_inside(where, folder, name)
     if path is None:
-        raise DatasetError(f"{where}: picture {folder / name} is missing")
+        raise DatasetError(f"{where}: picture {inside(where, folder, name)} is missing")
     return path
 
 
-def picture_file(where: str, folder: Path, name: str) -> Path | None:
+def file_inside(where: str, folder: Path, name: str) -> Path | None:
     """Return the file or ``None``; a name without suffix may mean any of PNG, JPEG, WebP."""
-    path = inside(where, folder, name)
+    path = _inside(where, folder, name)
+    return None if path is None else _existing(path)
+
+
+def _existing(path: Path) -> Path | None:
     if path.is_file():
         return path
-    if path.suffix not in SUFFIXES:
-        for suffix in SUFFIXES:
-            candidate = path.with_name(path.name + suffix)
-            if candidate.is_file():
-                return candidate
-    return None
+    if path.suffix in SUFFIXES:
+        return None
+    named = (path.with_name(path.name + suffix) for suffix in SUFFIXES)
+    return next((candidate for candidate in named if candidate.is_file()), None)
 
 
 def read_picture(path: Path, intrinsics: Intrinsics) -> Rgb:

@@ -15,7 +15,8 @@ the points training started from, ``point_cloud/iteration_N/point_cloud.ply`` th
 ``transform_matrix`` is world_from_camera with OpenGL camera axes (x right, y up, z backward);
 it becomes OpenCV axes here. Intrinsics, camera model and distortion stand at the top and may be
 overridden per frame; where ``fl_y``, ``cx`` or ``cy`` are left out they are ``fl_x`` and the middle
-of the picture, as both programs define it. ``time`` is in seconds. Other keys are ignored.
+of the picture, as both programs define it, and ``w`` and ``h`` its size. ``time`` is in seconds.
+Other keys are ignored.
 A frame with instant-ngp's ``sharpness`` whose picture is missing was sorted out as blurred and is
 left out, as that program does; any other missing picture is an error.
 
@@ -39,7 +40,7 @@ import numpy as np
 
 from rfcore.camera import Intrinsics, Pose, TileOrigin
 from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions, assemble
-from rfcore.dataset.colmap import colmap_model_folder, read_colmap_source
+from rfcore.dataset.colmap import colmap_models, images_file, read_colmap_source
 from rfcore.dataset.keys import (
     POSE_SHAPES,
     anchor_at,
@@ -53,11 +54,11 @@ from rfcore.dataset.kitti import OXTS, read_kitti_raw_source, read_kitti_source
 from rfcore.dataset.picture_file import (
     MaskFile,
     PictureFile,
+    file_inside,
     find_picture,
-    inside,
-    picture_file,
+    is_absolute,
 )
-from rfcore.dataset.picture_header import picture_format
+from rfcore.dataset.picture_header import picture_format, picture_header
 from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
 from rfcore.dataset.recording import read_recording_source
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
@@ -85,7 +86,7 @@ class AppliedTransform:
         """Return points of the file in the original world."""
         pose = self.original_from_turned
         turned = points.xyz_m / self.scale @ np.array(pose.rotation_matrix()).T
-        return SourcePoints(turned + pose.translation_m, points.rgb)
+        return SourcePoints(turned + pose.translation_m, points.rgb, points.note)
 
 
 def read_transforms_source(file: Path) -> Source:
@@ -98,7 +99,14 @@ def read_transforms_source(file: Path) -> Source:
     applied = _applied(str(file), top)
     kept = [(i, frame) for i, frame in enumerate(frames) if not _sorted_out(file, i, frame)]
     pictures = tuple(_picture(file, content, i, frame) for i, frame in kept)
-    points = _points(file, top)
+    notes: list[str] = []
+    absolute = sum(is_absolute(picture.name) for picture in pictures)
+    if absolute:
+        notes.append(
+            f"{absolute} of {len(frames)} pictures are named by absolute paths; the files below "
+            f"{file.parent} are taken"
+        )
+    points = _points(file, top, notes)
     if applied is not None:
         pictures = tuple(
             replace(picture, world_from_cam=applied.undo(picture.world_from_cam))
@@ -108,7 +116,7 @@ def read_transforms_source(file: Path) -> Source:
     missing = len(frames) - len(kept)
     exposure_varies = top.choice("exposure", ("auto", "fixed"), "fixed") == "auto"
     anchor = anchor_at(str(file), content.get("anchor"))
-    return Source(file, pictures, points, missing, exposure_varies, anchor)
+    return Source(file, pictures, points, missing, exposure_varies, anchor, tuple(notes))
 
 
 def transforms_file(folder: Path) -> Path | None:
@@ -127,7 +135,7 @@ def _sorted_out(file: Path, index: int, frame: Any) -> bool:
     if not isinstance(frame, dict) or "sharpness" not in frame:
         return False
     where = f"{file}: frames[{index}]"
-    return picture_file(where, file.parent, table_at(where, frame).text("file_path")) is None
+    return file_inside(where, file.parent, table_at(where, frame).text("file_path")) is None
 
 
 def _picture(file: Path, content: dict[str, Any], index: int, frame: Any) -> SourcePicture:
@@ -135,16 +143,17 @@ def _picture(file: Path, content: dict[str, Any], index: int, frame: Any) -> Sou
     name = table_at(where, frame).text("file_path")
     where = f"{where} ({name})"
     keys = table_at(where, frame)
-    camera = _camera(where, table_at(where, ChainMap(frame, content)))
+    path = find_picture(where, file.parent, name)
+    camera = _camera(where, table_at(where, ChainMap(frame, content)), path)
     rows = keys.matrix("transform_matrix", POSE_SHAPES)
     mask = None
     if keys.value("mask_path", None) is not None:
         mask = MaskFile(find_picture(f"{where}: mask", file.parent, keys.text("mask_path")))
-    opened = PictureFile.of(find_picture(where, file.parent, name), camera.intrinsics, mask)
+    opened = PictureFile.of(path, camera.intrinsics, mask)
     opencv_rows = [[r[0], -r[1], -r[2], r[3]] for r in rows]
     return SourcePicture(
         where=where,
-        name=name,
+        name=name.replace("\\", "/"),
         camera=camera,
         world_from_cam=pose_of_rows(where, "transform_matrix", opencv_rows),
         read=opened.read,
@@ -154,8 +163,12 @@ def _picture(file: Path, content: dict[str, Any], index: int, frame: Any) -> Sou
     )
 
 
-def _camera(where: str, keys: Table) -> SourceCamera:
-    width_px, height_px = keys.whole("w"), keys.whole("h")
+def _camera(where: str, keys: Table, picture: Path) -> SourceCamera:
+    size_px = (0, 0) if "w" in keys and "h" in keys else picture_header(picture).size_px
+    width_px, height_px = (
+        keys.whole(key) if key in keys else side_px
+        for key, side_px in zip(("w", "h"), size_px, strict=True)
+    )
     fx_px = _focal(keys, "fl_x", "camera_angle_x", width_px)
     has_fy = "fl_y" in keys or "camera_angle_y" in keys
     with blamed_on(where):
@@ -202,10 +215,15 @@ def _applied(where: str, content: Table) -> AppliedTransform | None:
     return AppliedTransform(turned_from_original.inverse(), scale)
 
 
-def _points(file: Path, content: Table) -> SourcePoints | None:
+def _points(file: Path, content: Table, notes: list[str]) -> SourcePoints | None:
     if content.value("ply_file_path", None) is None:
         return None
-    return read_points(inside(str(file), file.parent, content.text("ply_file_path")))
+    name = content.text("ply_file_path")
+    path = file_inside(str(file), file.parent, name)
+    if path is None:
+        notes.append(f"no points: {name}, which {file.name} names, is missing")
+        return None
+    return read_points(path)
 
 
 def read_inria_source(file: Path) -> Source:
@@ -320,6 +338,9 @@ def _read_folder(folder: Path) -> Source:
     if len(found) > 1:
         names = ", ".join(str(file) for file in found)
         raise DatasetError(f"{folder}: holds several datasets, name one of them: {names}")
+    models = colmap_models(folder)
+    if models and found[0].parent == models[0]:
+        return read_colmap_source(models[0], models[1:])
     return read_source(found[0])
 
 
@@ -339,11 +360,10 @@ def _candidates(folder: Path) -> list[Path]:
     named = [folder / name for name in ("camera.toml", "cameras.json", "calib.txt")]
     found = [file for file in named if file.is_file()]
     transforms = transforms_file(folder)
-    model = colmap_model_folder(folder)
+    models = colmap_models(folder)
     if (folder / OXTS / "data").is_dir():
         found.append(folder / OXTS)
     if transforms is not None:
         found.append(transforms)
-    if model is not None:
-        found.append(next(f for f in (model / "images.bin", model / "images.txt") if f.is_file()))
+    found += [file for model in models[:1] if (file := images_file(model)) is not None]
     return found

@@ -50,10 +50,14 @@ class SourcePicture:
 
 @dataclass(frozen=True)
 class SourcePoints:
-    """Surface points in the dataset's world: ``xyz_m`` float64 [N, 3], ``rgb`` uint8 [N, 3]."""
+    """Surface points in the dataset's world: ``xyz_m`` float64 [N, 3], ``rgb`` uint8 [N, 3].
+
+    ``note`` says what was done to them to be so.
+    """
 
     xyz_m: NDArray[np.float64]
     rgb: NDArray[np.uint8]
+    note: str = ""
 
     def __post_init__(self) -> None:
         n = len(self.xyz_m)
@@ -86,21 +90,40 @@ class Source:
     notes: tuple[str, ...] = ()
 
 
+COLOURS = [
+    tuple(f"{prefix}{name}" for name in ("red", "green", "blue")) for prefix in ("", "diffuse_")
+]
+"""Names of the properties that hold colours."""
+GREY = 128
+FULL = {"u1": 255, "u2": 65_535, "f4": 1, "f8": 1}
+"""The value of white, by the type of the property; floats above 1 are 0..255."""
+
+
 def read_points(path: Path) -> SourcePoints:
-    """Read x, y, z in metres and red, green, blue 0..255 of every vertex.
+    """Read x, y, z in metres and the colour of every vertex; grey where it has none.
 
     Raises ``DatasetError`` naming the file.
     """
     try:
-        table = read_vertices(path, ("x", "y", "z", "red", "green", "blue"))
+        table = read_vertices(path, ("x", "y", "z"))
         xyz_m = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-        return SourcePoints(xyz_m, _rgb(path, table))
+        return SourcePoints(xyz_m, *_rgb(path, table))
     except (FieldFormatError, InvalidInput) as error:
         raise DatasetError(f"points of {path}: {error}") from error
 
 
-def _rgb(path: Path, table: Table) -> NDArray[np.uint8]:
-    colours = [table[name] for name in ("red", "green", "blue")]
-    if any(colour.dtype != np.uint8 for colour in colours):
-        raise DatasetError(f"points of {path}: red, green, blue must be uchar, 0..255")
-    return np.stack(colours, axis=1)
+def _rgb(path: Path, table: Table) -> tuple[NDArray[np.uint8], str]:
+    """Return colours 0..255, and a note where they were not stated so."""
+    present = set(table.dtype.names or ())
+    names = next((names for names in COLOURS if set(names) <= present), None)
+    if names is None:
+        return np.full((len(table), 3), GREY, np.uint8), f"{path} has no colours: points are grey"
+    colours = np.stack([table[name] for name in names], axis=1)
+    kind = colours.dtype.str[1:]
+    if kind == "u1":
+        return colours, ""
+    if kind not in FULL:
+        raise DatasetError(f"points of {path}: colours of type {kind}; they must be uchar, 0..255")
+    full = 255 if kind in ("f4", "f8") and colours.max(initial=0) > 1 else FULL[kind]
+    bytes_ = np.clip(np.nan_to_num(colours.astype(np.float64)) * (255 / full) + 0.5, 0, 255)
+    return bytes_.astype(np.uint8), f"{path}: colours of type {kind} are taken as 0..{full}"

@@ -10,7 +10,8 @@ from rfcore.field.interface import (
 )
 from rfcore.field.ngp import NgpField
 from rfcore.field.quality import FULL, Quality
-from rfcore.field.splat_file import read_splat_file, write_ply
+from rfcore.field.splat_file import read_splat_file
+from rfcore.field.splat_ply import write_ply
 from rfcore.field.splats import SplatField
 from rfcore.field.store import FieldStore, load_field, save_field
 

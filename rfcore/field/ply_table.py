@@ -1,9 +1,9 @@
-"""The header and the vertex table of a PLY file (G. Turk, "The PLY Polygon File Format", 1994).
+"""The header and the tables of a PLY file (G. Turk, "The PLY Polygon File Format", 1994).
 
-Read: any of the three formats, ``element vertex`` first, scalar properties in any order; further
-elements are ignored, comments are kept. The row count is checked against the size of the file
-before anything is allocated. Rows of text are one a line, with as many numbers as there are
-properties; text of nine digits gives back the float32 it was written from.
+Read: any of the three formats, scalar properties in any order, elements in any order as long as no
+list stands before the one that is read; comments are kept. Row counts are checked against the size
+of the file before anything is allocated. Rows of text are one a line, with as many numbers as there
+are properties; text of nine digits gives back the float32 it was written from.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from rfcore.files import DECODED_BYTES, whole_file
 
 MAX_HEADER_BYTES = 65_536
 ASCII = "ascii"
+VERTEX = "vertex"
 ORDERS = {ASCII: "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 """Byte order of a row, by the name of the format; rows of text are parsed into little-endian."""
 SPELLINGS = {
@@ -38,14 +39,33 @@ DTYPES = {name: code for code, names in SPELLINGS.items() for name in names}
 
 
 @dataclass(frozen=True)
-class Header:
-    """The header of a file: the format's name, the number of vertices, the dtype of a row."""
+class Element:
+    """One table of a file; ``problem`` says why its rows cannot be read, if they cannot."""
 
-    format: str
+    name: str
     count: int
     dtype: np.dtype[Any]
-    comments: tuple[str, ...] = ()
+    problem: str | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the properties."""
+        return self.dtype.names or ()
+
+
+@dataclass(frozen=True)
+class Header:
+    """The header of a file: the format's name, its tables in order, where the first row is."""
+
+    format: str
+    elements: tuple[Element, ...]
+    comments: tuple[str, ...]
     """The text after ``comment`` of each such line, in the order of the file."""
+    start: int
+
+    def element(self, name: str) -> Element | None:
+        """Return the element of that name, None without one."""
+        return next((element for element in self.elements if element.name == name), None)
 
 
 def read_header(path: Path, file: BinaryIO) -> Header:
@@ -62,19 +82,22 @@ def read_header(path: Path, file: BinaryIO) -> Header:
         raise FieldFormatError(
             f"{path}: '{found}' where 'format' and one of {', '.join(ORDERS)} 1.0 is needed"
         )
-    elements = [i for i, line in enumerate(words) if line[0] == "element"]
-    _check_first_element(path, words, elements)
-    end = elements[1] if len(elements) > 1 else len(words)
     form = words[0][1]
-    count, dtype = _row_count(path, words[1]), _row_dtype(path, words[2:end], ORDERS[form])
-    return Header(form, count, dtype, comments)
+    starts = [i for i, line in enumerate(words) if line[0] == "element"]
+    if starts[:1] != [1]:
+        raise FieldFormatError(f"{path}: no 'element' follows the format")
+    elements = tuple(
+        _element(path, words[i:end], ORDERS[form])
+        for i, end in zip(starts, [*starts[1:], len(words)], strict=True)
+    )
+    return Header(form, elements, comments, file.tell())
 
 
 def _lines(path: Path, file: BinaryIO) -> list[str]:
     lines: list[str] = []
     while file.tell() < MAX_HEADER_BYTES:
         line = file.readline(MAX_HEADER_BYTES)
-        lines.append(_printable(line.decode("latin-1").strip()))
+        lines.append(printable(line.decode("latin-1").strip()))
         if lines[0] != "ply":
             raise FieldFormatError(f"{path}: does not start with 'ply'")
         if lines[-1] == "end_header":
@@ -84,40 +107,26 @@ def _lines(path: Path, file: BinaryIO) -> list[str]:
     raise FieldFormatError(f"{path}: no 'end_header' in the first {MAX_HEADER_BYTES} bytes")
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     """Return text whose control characters, which a terminal might obey, are question marks."""
     return "".join(c if c.isprintable() or c == "\t" else "?" for c in text)
 
 
-def _check_first_element(path: Path, words: list[list[str]], elements: list[int]) -> None:
-    first = words[elements[0]][1:2] if elements else []
-    if first == ["chunk"]:
-        raise FieldFormatError(
-            f"{path}: a compressed .ply of PlayCanvas or SuperSplat; convert it first: "
-            "splat-transform IN.compressed.ply OUT.ply"
-        )
-    if not elements or elements[0] != 1 or first != ["vertex"]:
-        raise FieldFormatError(f"{path}: the first element must be 'vertex'")
-
-
-def _row_count(path: Path, element: list[str]) -> int:
-    if len(element) != 3 or not element[2].isascii() or not element[2].isdigit():
-        raise FieldFormatError(f"{path}: '{' '.join(element)}' does not state a count")
-    return int(element[2][:20])
-
-
-def _row_dtype(path: Path, properties: list[list[str]], order: str) -> np.dtype[Any]:
+def _element(path: Path, lines: list[list[str]], order: str) -> Element:
+    """Return one element of its header lines; ``FieldFormatError`` without a count."""
+    declared = lines[0]
+    if len(declared) != 3 or not declared[2].isascii() or not declared[2].isdigit():
+        raise FieldFormatError(f"{path}: '{' '.join(declared)}' does not state a count")
+    name, count = declared[1], int(declared[2][:20])
     columns: list[tuple[str, str]] = []
-    for line in properties:
+    for line in lines[1:]:
         if len(line) != 3 or line[0] != "property" or line[1] not in DTYPES:
-            raise FieldFormatError(
-                f"{path}: '{' '.join(line)}' is not a scalar property (lists are not read)"
-            )
+            problem = f"'{' '.join(line)}' is not a scalar property (lists are not read)"
+            return Element(name, count, np.dtype([]), problem)
         columns.append((line[2], order + DTYPES[line[1]]))
-    names = [name for name, _ in columns]
-    if not names or len(set(names)) != len(names):
-        raise FieldFormatError(f"{path}: vertex properties are missing or repeated")
-    return np.dtype(columns)
+    if len(dict(columns)) != len(columns):
+        return Element(name, count, np.dtype([]), f"{name} properties are repeated")
+    return Element(name, count, np.dtype(columns))
 
 
 NAMES = {np.dtype("<f4"): "float", np.dtype("<f8"): "double", np.dtype("u1"): "uchar"}
@@ -138,40 +147,63 @@ def read_vertices(path: Path, required: Sequence[str]) -> Table:
     """
     try:
         with path.open("rb") as file:
-            header = read_vertex_header(path, file, required)
-            size_bytes = header.count * header.dtype.itemsize
+            header = read_header(path, file)
+            vertex = checked_element(path, file, header, VERTEX, required)
+            size_bytes = vertex.count * vertex.dtype.itemsize
             if size_bytes > DECODED_BYTES:
                 raise FieldFormatError(
-                    f"{path}: {header.count} vertices take {size_bytes / 1e9:.2f} GB, the limit "
+                    f"{path}: {vertex.count} vertices take {size_bytes / 1e9:.2f} GB, the limit "
                     f"is {DECODED_BYTES / 1e9:.2f} GB; write fewer points"
                 )
-            table = np.empty(header.count, header.dtype)
-            for start, rows in read_rows(path, file, header):
+            table = np.empty(vertex.count, vertex.dtype)
+            for start, rows in read_rows(path, file, header, vertex):
                 table[start : start + len(rows)] = rows
             return table
     except OSError as error:
         raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def read_vertex_header(path: Path, file: BinaryIO, required: Sequence[str]) -> Header:
-    """Read the header of an open file and check it as ``read_vertices`` does."""
-    header = read_header(path, file)
-    _check_properties(path, header, required)
-    _check_size(path, header, file)
-    return header
+def checked_element(
+    path: Path, file: BinaryIO, header: Header, name: str, required: Sequence[str]
+) -> Element:
+    """Return an element that has the ``required`` properties and fits into the rest of the file.
+
+    Raises ``FieldFormatError``.
+    """
+    element = header.element(name)
+    if element is None:
+        there = ", ".join(element.name for element in header.elements)
+        raise FieldFormatError(f"{path}: no element '{name}' among its elements ({there})")
+    until = header.elements[: header.elements.index(element) + 1]
+    unread = (one for one in until if not one.names)
+    problem = next((one.problem or f"{one.name} has no properties" for one in unread), None)
+    if problem is not None:
+        raise FieldFormatError(f"{path}: {problem}")
+    missing = [key for key in required if key not in element.names]
+    if missing:
+        raise FieldFormatError(f"{path}: no {name} property {', '.join(missing)}")
+    _check_size(path, header, until, file)
+    return element
 
 
-def read_rows(path: Path, file: BinaryIO, header: Header) -> Iterator[tuple[int, Table]]:
+def read_rows(
+    path: Path, file: BinaryIO, header: Header, element: Element
+) -> Iterator[tuple[int, Table]]:
     """Yield (number of the first, rows) for a few thousand rows at a time, until all are read.
 
-    ``file`` stands behind the header. Raises ``FieldFormatError``, ``OSError``.
+    ``element`` is one that was checked. Raises ``FieldFormatError``, ``OSError``.
     """
-    for start in range(0, header.count, ROWS_AT_ONCE):
-        wanted = min(ROWS_AT_ONCE, header.count - start)
+    file.seek(header.start)
+    for earlier in header.elements[: header.elements.index(element)]:
         if header.format == ASCII:
-            yield start, _text_rows(path, header, file, start, wanted)
+            for _ in range(earlier.count):
+                file.readline(LONGEST_VALUE_BYTES * len(earlier.names))
         else:
-            yield start, _binary_rows(path, header, file, start, wanted)
+            file.seek(earlier.count * earlier.dtype.itemsize, os.SEEK_CUR)
+    for start in range(0, element.count, ROWS_AT_ONCE):
+        wanted = min(ROWS_AT_ONCE, element.count - start)
+        read = _text_rows if header.format == ASCII else _binary_rows
+        yield start, read(path, element, file, start, wanted)
 
 
 def write_vertices(path: Path, table: Table, comments: Sequence[str] = ()) -> None:
@@ -190,45 +222,39 @@ def write_vertices(path: Path, table: Table, comments: Sequence[str] = ()) -> No
         table.tofile(file)
 
 
-def _check_properties(path: Path, header: Header, required: Sequence[str]) -> None:
-    missing = [name for name in required if name not in (header.dtype.names or ())]
-    if missing:
-        raise FieldFormatError(f"{path}: no vertex property {', '.join(missing)}")
-
-
-def _check_size(path: Path, header: Header, file: BinaryIO) -> None:
-    start = file.tell()
-    left_bytes = file.seek(0, os.SEEK_END) - start
-    file.seek(start)
-    row_bytes = header.dtype.itemsize
+def _check_size(path: Path, header: Header, elements: Sequence[Element], file: BinaryIO) -> None:
+    left_bytes = file.seek(0, os.SEEK_END) - header.start
+    row_bytes = [element.dtype.itemsize for element in elements]
     if header.format == ASCII:
-        row_bytes = SHORTEST_VALUE_BYTES * len(header.dtype.names or ())
+        row_bytes = [SHORTEST_VALUE_BYTES * len(element.names) for element in elements]
         left_bytes += 1  # the last row need not end with a newline
-    if header.count * row_bytes > left_bytes:
+    claimed_bytes = sum(e.count * size for e, size in zip(elements, row_bytes, strict=True))
+    if claimed_bytes > left_bytes:
         raise FieldFormatError(
-            f"{path}: the header claims {header.count * row_bytes} bytes of vertices or more, "
+            f"{path}: the header claims {claimed_bytes} bytes of {elements[-1].name} or more, "
             f"{left_bytes} follow it"
         )
 
 
-def _binary_rows(path: Path, header: Header, file: BinaryIO, start: int, wanted: int) -> Table:
-    data = file.read(wanted * header.dtype.itemsize)
-    rows = len(data) // header.dtype.itemsize
+def _binary_rows(path: Path, element: Element, file: BinaryIO, start: int, wanted: int) -> Table:
+    dtype = element.dtype
+    data = file.read(wanted * dtype.itemsize)
+    rows = len(data) // dtype.itemsize
     if rows < wanted:
-        raise FieldFormatError(f"{path}: {start + rows} rows, the header claims {header.count}")
-    return np.frombuffer(data, header.dtype)
+        raise FieldFormatError(f"{path}: {start + rows} rows, the header claims {element.count}")
+    return np.frombuffer(data, dtype)
 
 
-def _text_rows(path: Path, header: Header, file: BinaryIO, start: int, wanted: int) -> Table:
-    names = header.dtype.names or ()
+def _text_rows(path: Path, element: Element, file: BinaryIO, start: int, wanted: int) -> Table:
+    names = element.names
     limit_bytes = LONGEST_VALUE_BYTES * len(names)
     lines = [line for _ in range(wanted) if (line := file.readline(limit_bytes))]
     values = _numbers(path, lines, start, len(names))
     if len(lines) < wanted:
         raise FieldFormatError(
-            f"{path}: {start + len(lines)} rows, the header claims {header.count}"
+            f"{path}: {start + len(lines)} rows, the header claims {element.count}"
         )
-    table = np.empty(wanted, header.dtype)
+    table = np.empty(wanted, element.dtype)
     with np.errstate(over="ignore"):
         for column, name in enumerate(names):
             table[name] = values[:, column]

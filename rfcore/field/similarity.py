@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.random import default_rng
 from numpy.typing import NDArray
 
 from rfcore.camera import Pose, TileOrigin
@@ -73,9 +74,9 @@ def moved(gaussians: Gaussians, dst_from_src: Similarity) -> Gaussians:
     return replace(
         gaussians,
         means=np.ascontiguousarray(means, np.float32),
-        quaternions=_turned(gaussians.quaternions, dst_from_src.pose.rotation),
+        quaternions=turned_rotations(gaussians.quaternions, dst_from_src.pose.rotation),
         log_scales=(gaussians.log_scales.astype(np.float64) + widening).astype(np.float32),
-        sh=_turned_sh(gaussians.sh, dst_from_src.rotation),
+        sh=turned_sh(gaussians.sh, dst_from_src.rotation),
     )
 
 
@@ -89,27 +90,27 @@ def spherical_harmonics(directions: F64) -> F64:
     return np.stack(basis, axis=1)
 
 
-def _turned(quaternions: F32, by: tuple[float, float, float, float]) -> F32:
+def turned_rotations(quaternions: F32, by: tuple[float, float, float, float]) -> F32:
     """Return ``by`` times each quaternion [N, 4] (w, x, y, z); norms stay."""
     w, x, y, z = by
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.ascontiguousarray(quaternions.astype(np.float64) @ left.T, np.float32)
 
 
-def _turned_sh(sh: F32, rotation: F64) -> F32:
+def turned_sh(sh: F32, rotation: F64) -> F32:
     """Return the coefficients [N, K, 3] of colours rotated with the field.
 
     Each band is closed under rotation; its matrix is solved from its values in many directions.
     """
-    turned = sh.astype(np.float64)
-    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    turned = sh.copy()
+    directions = default_rng(0).normal(size=(DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     here, there = spherical_harmonics(directions), spherical_harmonics(directions @ rotation)
     for degree in range(1, round(sh.shape[1] ** 0.5)):
         band = slice(degree**2, (degree + 1) ** 2)
         matrix = np.linalg.lstsq(here[:, band], there[:, band], rcond=None)[0]
         turned[:, band] = np.einsum("ij,njc->nic", matrix, sh[:, band].astype(np.float64))
-    return np.ascontiguousarray(turned, np.float32)
+    return turned
 
 
 def read_field_from_world(path: Path) -> Similarity:

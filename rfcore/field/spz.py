@@ -1,14 +1,22 @@
 """3D Gaussians as SPZ, a compressed format of web viewers (github.com/nianticlabs/spz).
 
-One block an attribute, all little-endian: positions as 24-bit fixed point, opacity in 8 bits, the
-first band of the colour as ``0.15 sh + 0.5``, logarithms of the scales in sixteenths from -10 on,
-rotations by their three smallest components of 10 bits (version 2: x, y, z in 8 bits), the other
-bands as ``128 sh + 128`` rounded to 5 bits (first band) and 4 bits. Versions 2 and 3 are one gzip
-stream with a header of 16 bytes, version 4 has a plain header of 32 bytes, a table of lengths and
-one Zstandard stream a block. Version 3 is written, 2 to 4 are read.
+One block an attribute, all little-endian: positions as 24-bit fixed point (version 1: float16),
+opacity in 8 bits, the first band of the colour as ``0.15 sh + 0.5``, logarithms of the scales in
+sixteenths from -10 on, rotations by their three smallest components of 10 bits (versions 1 and 2:
+x, y, z in 8 bits), the other bands as ``128 sh + 128`` rounded to 5 bits (first band) and 4 bits.
+Versions 1 to 3 are one gzip stream with a header of 16 bytes, version 4 has a plain header of 32
+bytes, a table of lengths and one Zstandard stream a block that is not empty. Extensions, records of
+a type, a length and so many bytes, stand behind the splats, in version 4 before the table.
+Versions 1 to 4 are read, 3 and 4 are written.
 
-It is lossy: for looking at rather than for coding against. Axes are those of the file both ways.
-24 bits have no room for a street and its sky, which is brought to 2 km.
+It is lossy: for looking at rather than for coding against. 24 bits have no room for a street and
+its sky, which is brought to 2 km.
+
+**Axes.** The extension ``COORDINATE_SYSTEM`` (SPZ_ADOBE_coordinate_system) names what x, y and z of
+the file point to; it is obeyed, so that splats come in with the axes of a .ply, RDF (right, down,
+front). Version 4 is written with it. Without it, tools disagree: splat-transform 3 keeps the axes
+of a .ply, Niantic's library and splat-transform 2 turn them half round x. Such a file is taken as
+it is.
 """
 
 from __future__ import annotations
@@ -18,60 +26,70 @@ import io
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import TileOrigin
+from rfcore.camera import Pose
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.extras import needs
+from rfcore.field.similarity import turned_rotations, turned_sh
 from rfcore.field.splat_archive import check_decoded_size
+from rfcore.field.stored_splats import F64, StoredSplats, finite_logits
 from rfcore.files import write_whole
-from rfcore.raster.gaussians import Gaussians, with_sky_at
+from rfcore.raster.gaussians import F32, Gaussians, with_sky_at
 
-MAGIC, VERSION = 0x5053474E, 3
+MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")
 """Magic, version, count, SH degree, fraction bits, flags; reserved, or in version 4 the number of
 streams."""
 HEADER_4_BYTES = 32
 GZIP_MAGIC = b"\x1f\x8b"
-EXTENSIONS_FLAG = 2
-CONVERT = "convert it first (npm package @playcanvas/splat-transform): splat-transform {0} {1}.ply"
-ANTIALIASED_FLAG = 1
+ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
+RECORD = struct.Struct("<II")
+MAX_EXTENSIONS_BYTES = 1 << 24
+COORDINATE_SYSTEM = 0xADBE0003
+MOST_NAMED = 8
+"""Extensions that are named, of those left out."""
+SYSTEMS = [
+    *(f"{x}{y}{z}" for z in "BF" for y in "DU" for x in "LR"),
+    *(f"{x}{y}{z}" for y in "FB" for z in "DU" for x in "LR"),
+]
+"""Names of the coordinate systems 1 to 16, LDB to RBU: what x, y and z point to."""
+PLY_AXES = "RDF"
+TOWARDS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0)} | {
+    "F": (0, 0, 1),
+    "B": (0, 0, -1),
+}
+"""Directions with the axes of a .ply."""
+MOST_SH_DEGREE = 4
 FIXED_POINT_BITS = 24
 FINEST_FRACTION_BITS = 12
 COLOUR_SCALE = 0.15
 SKY_DISTANCE_M = 2000.0
-COMPRESSION_LEVEL = 6
+GZIP_LEVEL, ZSTANDARD_LEVEL = 6, 12
 
-F32 = NDArray[np.float32]
+Version = Literal[3, 4]
 U8 = NDArray[np.uint8]
 
 
-def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool) -> None:
+def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool, version: Version = 3) -> None:
     """Write ``path``, whole or not at all; raises what ``encode_spz`` raises."""
-    write_whole(path, encode_spz(gaussians, antialiased=antialiased))
+    write_whole(path, encode_spz(gaussians, antialiased=antialiased, version=version))
 
 
-def encode_spz(gaussians: Gaussians, *, antialiased: bool) -> bytes:
+def encode_spz(gaussians: Gaussians, *, antialiased: bool, version: Version = 3) -> bytes:
     """Return ``gaussians`` as a file. The same Gaussians give the same bytes.
 
-    Raises ``InvalidInput`` where a mean is farther from the origin than 24 bits of whole metres.
+    Raises ``InvalidInput`` where a mean is farther from the origin than 24 bits of whole metres,
+    ``BackendUnavailable`` for version 4 without Zstandard.
     """
     gaussians = with_sky_at(gaussians, SKY_DISTANCE_M)
     fraction_bits = _fraction_bits(gaussians.means)
-    header = HEADER.pack(
-        MAGIC,
-        VERSION,
-        len(gaussians),
-        gaussians.sh_degree,
-        fraction_bits,
-        ANTIALIASED_FLAG if antialiased else 0,
-        0,
-    )
     opacity = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     blocks = (
         _fixed_point(gaussians.means, fraction_bits),
@@ -81,8 +99,23 @@ def encode_spz(gaussians: Gaussians, *, antialiased: bool) -> bytes:
         _smallest_three(gaussians.quaternions),
         _harmonics(gaussians.sh[:, 1:]),
     )
-    data = header + b"".join(block.tobytes() for block in blocks)
-    return gzip.compress(data, COMPRESSION_LEVEL, mtime=0)
+    filled = [block.tobytes() for block in blocks if block.size]
+    flags = ANTIALIASED_FLAG * antialiased | EXTENSIONS_FLAG * (version == 4)
+    header = HEADER.pack(
+        *(MAGIC, version, len(gaussians), gaussians.sh_degree, fraction_bits, flags),
+        len(filled) if version == 4 else 0,
+    )
+    if version == 3:
+        return gzip.compress(header + b"".join(filled), GZIP_LEVEL, mtime=0)
+    with needs("spz"):
+        from zstandard import ZstdCompressor
+
+    axes = struct.pack("<I", SYSTEMS.index(PLY_AXES) + 1)
+    extension = RECORD.pack(COORDINATE_SYSTEM, len(axes)) + axes
+    coded = [ZstdCompressor(ZSTANDARD_LEVEL).compress(block) for block in filled]
+    table = [struct.pack("<QQ", *map(len, pair)) for pair in zip(coded, filled, strict=True)]
+    table_at = struct.pack("<I12x", HEADER_4_BYTES + len(extension))
+    return b"".join([header, table_at, extension, *table, *coded])
 
 
 def _fraction_bits(means_m: F32) -> int:
@@ -148,8 +181,8 @@ class _Header:
     @property
     def splat_bytes(self) -> tuple[int, ...]:
         """Bytes of one splat: position, opacity, colour, scale, rotation, other bands."""
-        rotation = 3 if self.version == 2 else 4
-        return (9, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1) ** 2 - 1))
+        position, rotation = 6 if self.version == 1 else 9, 3 if self.version < 3 else 4
+        return (position, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1) ** 2 - 1))
 
     @property
     def block_bytes(self) -> tuple[int, ...]:
@@ -157,69 +190,81 @@ class _Header:
         return tuple(self.count * size for size in self.splat_bytes)
 
 
-def read_open_spz(
-    path: Path, file: BinaryIO, tile_origin: TileOrigin | None, max_bytes: int
-) -> tuple[Gaussians, bool]:
-    """Return an open file's Gaussians, ``tile_origin`` taken off, and whether they are drawn
-    antialiased; ``path`` is its name.
+def read_open_spz(path: Path, file: BinaryIO, max_bytes: int) -> StoredSplats:
+    """Return the splats of an open file named ``path``.
 
-    Opacities of 0 and 255 are taken half a step inwards, where their logits are finite. Raises
-    ``FieldFormatError`` for other versions, extensions, SH beyond degree 3, what is cut short or
-    too long, and for Gaussians that take more than ``max_bytes`` of memory.
+    Raises ``FieldFormatError`` for other versions, what is cut short or too long, and for splats
+    that take more than ``max_bytes`` of memory.
     """
     try:
-        header, blocks = _blocks(path, file, max_bytes)
-        gaussians = _gaussians(header, blocks, tile_origin or TileOrigin())
+        header, blocks, extensions = _parts(path, file, max_bytes)
+        return _with_ply_axes(_splats(header, blocks), dict(_records(extensions)))
     except (InvalidInput, EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise FieldFormatError(f"{path}: {error}") from error
-    return gaussians, bool(header.flags & ANTIALIASED_FLAG)
 
 
-def _blocks(path: Path, file: BinaryIO, max_bytes: int) -> tuple[_Header, list[U8]]:
+def _parts(path: Path, file: BinaryIO, max_bytes: int) -> tuple[_Header, list[U8], bytes]:
+    """Return the header, the blocks and the records of extensions."""
     start = file.read(HEADER_4_BYTES)
-    if start.startswith(GZIP_MAGIC):
-        file.seek(0)
-        with gzip.GzipFile(fileobj=file) as stream:
-            header = _header(path, stream.read(HEADER.size), (2, 3), max_bytes)
-            blocks = [_exactly(stream, size) for size in header.block_bytes]
-            if stream.read(1):
-                raise FieldFormatError(f"{path}: goes on after its {header.count} splats")
-            return header, blocks
-    header = _header(path, start, (4,), max_bytes)
-    return header, _zstandard_blocks(path, file, header, start)
+    if not start.startswith(GZIP_MAGIC):
+        header = _header(path, start, (4,), max_bytes)
+        return header, *_zstandard_blocks(path, file, header, start)
+    file.seek(0)
+    with gzip.GzipFile(fileobj=file) as stream:
+        header = _header(path, stream.read(HEADER.size), (1, 2, 3), max_bytes)
+        blocks = [_exactly(stream, size) for size in header.block_bytes]
+        extensions = stream.read(MAX_EXTENSIONS_BYTES) if header.flags & EXTENSIONS_FLAG else b""
+        if stream.read(1):
+            raise FieldFormatError(f"{path}: goes on after its {header.count} splats")
+        return header, blocks, extensions
 
 
 def _header(path: Path, data: bytes, versions: tuple[int, ...], max_bytes: int) -> _Header:
     if len(data) < HEADER.size or HEADER.unpack_from(data)[0] != MAGIC:
         raise FieldFormatError(f"{path}: is no .spz: it does not begin with NGSP")
     _, version, count, sh_degree, fraction_bits, flags, _ = HEADER.unpack_from(data)
-    advice = CONVERT.format(path.name, path.stem)
     if version not in versions:
-        raise FieldFormatError(f"{path}: .spz of version {version}; 2 to 4 are read: {advice}")
-    if flags & EXTENSIONS_FLAG:
-        raise FieldFormatError(f"{path}: has extensions of a vendor, which are not read: {advice}")
-    if sh_degree > 3 or fraction_bits >= FIXED_POINT_BITS:
         raise FieldFormatError(
-            f"{path}: SH degree {sh_degree} and {fraction_bits} fraction bits; degrees 0..3 and "
-            f"0..{FIXED_POINT_BITS - 1} bits are read: {advice}"
+            f"{path}: .spz of version {version}, packed as {versions[-1]}; 1 to 4 are read: export "
+            "it as version 3 or 4"
+        )
+    if sh_degree > MOST_SH_DEGREE or fraction_bits >= FIXED_POINT_BITS:
+        raise FieldFormatError(
+            f"{path}: SH degree {sh_degree} and {fraction_bits} fraction bits; degrees "
+            f"0..{MOST_SH_DEGREE} and 0..{FIXED_POINT_BITS - 1} bits are read: it is damaged"
         )
     check_decoded_size(count, sh_degree, max_bytes)
     return _Header(version, count, sh_degree, fraction_bits, flags)
 
 
-def _zstandard_blocks(path: Path, file: BinaryIO, header: _Header, start: bytes) -> list[U8]:
+def needs_zstandard(start: bytes) -> bool:
+    """Tell whether a file that begins so is of a version that Zstandard compresses."""
+    return start.startswith(MAGIC.to_bytes(4, "little"))
+
+
+def load_zstandard() -> None:
+    """Import Zstandard, which cannot be done in a sandbox; raise ``BackendUnavailable``."""
     with needs("spz"):
-        from zstandard import ZstdDecompressor, ZstdError
+        import zstandard  # noqa: F401
+
+
+def _zstandard_blocks(
+    path: Path, file: BinaryIO, header: _Header, start: bytes
+) -> tuple[list[U8], bytes]:
+    load_zstandard()
+    from zstandard import ZstdDecompressor, ZstdError
 
     if len(start) < HEADER_4_BYTES:
         raise FieldFormatError(f"{path}: ends within its header of {HEADER_4_BYTES} bytes")
     count, table_at = struct.unpack_from("<BI", start, HEADER.size - 1)
-    if count not in (5, 6) or table_at != HEADER_4_BYTES:
+    sizes = [size for size in header.block_bytes if size or count == len(header.block_bytes)]
+    extensions_bytes = table_at - HEADER_4_BYTES
+    if count != len(sizes) or not 0 <= extensions_bytes <= MAX_EXTENSIONS_BYTES:
         raise FieldFormatError(f"{path}: {count} streams from byte {table_at} on are no .spz")
+    extensions = _exactly(file, extensions_bytes).tobytes()
     table = _exactly(file, 16 * count).view("<u8").reshape(count, 2).tolist()
-    table += [[0, 0]] * (6 - count)
     blocks = []
-    for size, (coded_bytes, decoded_bytes) in zip(header.block_bytes, table, strict=True):
+    for size, (coded_bytes, decoded_bytes) in zip(sizes, table, strict=True):
         if decoded_bytes != size or coded_bytes > size + size // 128 + 1024:
             raise FieldFormatError(
                 f"{path}: a stream of {coded_bytes} for {decoded_bytes} bytes where {size} are due"
@@ -229,7 +274,22 @@ def _zstandard_blocks(path: Path, file: BinaryIO, header: _Header, start: bytes)
             blocks.append(_exactly(ZstdDecompressor().stream_reader(coded), size))
         except ZstdError as error:
             raise FieldFormatError(f"{path}: {error}") from error
-    return blocks
+    filled = iter([block for block in blocks if block.size])
+    blocks = [next(filled) if size else np.empty(0, np.uint8) for size in header.block_bytes]
+    return blocks, extensions if header.flags & EXTENSIONS_FLAG else b""
+
+
+def _records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the type and the content of each record; raise ``EOFError``."""
+    at = 0
+    while at < len(extensions):
+        if at + RECORD.size > len(extensions):
+            raise EOFError("ends within the head of an extension")
+        kind, size = RECORD.unpack_from(extensions, at)
+        at += RECORD.size + size
+        if at > len(extensions):
+            raise EOFError(f"ends within an extension of {size} bytes")
+        yield kind, extensions[at - size : at]
 
 
 def _exactly(stream: _Stream, size: int) -> U8:
@@ -239,35 +299,82 @@ def _exactly(stream: _Stream, size: int) -> U8:
     return np.frombuffer(data, np.uint8)
 
 
-def _gaussians(header: _Header, blocks: list[U8], origin: TileOrigin) -> Gaussians:
+def _splats(header: _Header, blocks: list[U8]) -> StoredSplats:
     means, opacities, colours, scales, rotations, bands = (
         block.reshape(header.count, size)
         for block, size in zip(blocks, header.splat_bytes, strict=True)
     )
-    shares = np.clip(opacities[:, 0] / 255.0, 0.5 / 255.0, 254.5 / 255.0)
-    decode = _from_xyz if header.version == 2 else _from_smallest_three
+    decode = _from_smallest_three if header.version >= 3 else _from_xyz
     sh = np.concatenate([(colours / 255.0 - 0.5) / COLOUR_SCALE, bands / 128.0 - 1.0], axis=1)
-    arrays = (
-        _metres(means, header.fraction_bits, origin),
-        decode(rotations),
-        scales / 16.0 - 10.0,
-        np.log(shares / (1.0 - shares)),
-        sh.reshape(header.count, (header.sh_degree + 1) ** 2, 3),
+    if header.version == 1:
+        metres, step_m = means.view("<f2").astype(np.float64), 0.0
+    else:
+        metres, step_m = _metres(means, header.fraction_bits), 2.0**-header.fraction_bits
+    return StoredSplats(
+        metres,
+        decode(rotations).astype(np.float32),
+        (scales / 16.0 - 10.0).astype(np.float32),
+        finite_logits(opacities[:, 0] / 255.0).astype(np.float32),
+        sh.reshape(header.count, (header.sh_degree + 1) ** 2, 3).astype(np.float32),
+        bool(header.flags & ANTIALIASED_FLAG),
+        step_m,
     )
-    return Gaussians(*(np.ascontiguousarray(array, dtype=np.float32) for array in arrays))
 
 
-def _metres(fixed: U8, fraction_bits: int, origin: TileOrigin) -> NDArray[np.float64]:
+def _with_ply_axes(stored: StoredSplats, extensions: dict[int, bytes]) -> StoredSplats:
+    """Return the splats with the axes of a .ply, and say what was done and left out."""
+    content = extensions.pop(COORDINATE_SYSTEM, b"")
+    number = int.from_bytes(content, "little")
+    others = ", ".join(f"{kind:#010x}" for kind in list(extensions)[:MOST_NAMED])
+    notes = (f"extensions that no field has room for are left out: {others}",) if others else ()
+    if not content or number == 0:
+        said = (
+            "axes: the file states none, so they are taken as those of a .ply; some tools turn "
+            "them half round x (`rfedge field check NAME --drive DATASET` finds out)"
+        )
+        return replace(stored, notes=(said, *notes))
+    if number > len(SYSTEMS):
+        raise InvalidInput("axes", f"coordinate system {number}; 1 to {len(SYSTEMS)} are known")
+    name = SYSTEMS[number - 1]
+    said = f"axes: {name}, as the file states"
+    if name == PLY_AXES:
+        return replace(stored, notes=(said, *notes))
+    return replace(_turned(stored, name), notes=(f"{said}, turned to RDF of a .ply", *notes))
+
+
+def _turned(stored: StoredSplats, system: str) -> StoredSplats:
+    """Return splats of another coordinate system with the axes of a .ply."""
+    ply_from_file = np.array([TOWARDS[letter] for letter in system], float).T
+    sh, quaternions = stored.sh, stored.quaternions
+    rotation = ply_from_file
+    if np.linalg.det(ply_from_file) < 0:  # left-handed: y is mirrored first
+        rotation = ply_from_file * (1.0, -1.0, 1.0)
+        quaternions = quaternions * np.array([1, -1, 1, -1], np.float32)
+        sh = sh * _odd_in_y(sh.shape[1])[:, None]
+    pose = Pose.from_matrix(np.column_stack([rotation, np.zeros(3)]).tolist())
+    return replace(
+        stored,
+        means_m=stored.means_m @ ply_from_file.T,
+        quaternions=turned_rotations(quaternions, pose.rotation),
+        sh=np.concatenate([turned_sh(sh[:, :16], rotation), sh[:, 16:]], axis=1),
+    )
+
+
+def _odd_in_y(coefficients: int) -> F32:
+    """Return -1 for each harmonic whose sign is that of y, those of negative order, else 1."""
+    degrees = [int(i**0.5) for i in range(coefficients)]
+    return np.array([-1 if i < d * d + d else 1 for i, d in enumerate(degrees)], np.float32)
+
+
+def _metres(fixed: U8, fraction_bits: int) -> F64:
     wide = np.zeros((len(fixed), 3, 4), np.uint8)
     wide[..., 1:] = fixed.reshape(len(fixed), 3, 3)
     integers = wide.view("<i4")[..., 0] >> (32 - FIXED_POINT_BITS)
-    offset_m = np.array([origin.east_m, origin.north_m, origin.up_m])
-    metres: NDArray[np.float64] = integers / 2.0**fraction_bits - offset_m
-    return metres
+    return np.asarray(integers / 2.0**fraction_bits)
 
 
 def _from_xyz(coded: U8) -> NDArray[np.float64]:
-    """Return [N, 4] w, x, y, z of version 2, whose w is never negative."""
+    """Return [N, 4] w, x, y, z of versions 1 and 2, whose w is never negative."""
     xyz = coded / 127.5 - 1.0
     w = np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1, keepdims=True)))
     return np.concatenate([w, xyz], axis=1)

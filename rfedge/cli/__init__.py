@@ -10,6 +10,7 @@ from tyro.conf import subcommand
 from rfcore.program import parse_options, run_program
 from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.dataset import Dataset
+from rfedge.cli.doctor import Doctor
 from rfedge.cli.field import Field
 from rfedge.cli.localise import Localise
 from rfedge.cli.measure import Eval, LoadTest
@@ -35,6 +36,7 @@ Verb = (
     | Annotated[LoadTest, subcommand("loadtest")]
     | Annotated[Size, subcommand("size")]
     | Annotated[Dataset, subcommand("dataset")]
+    | Annotated[Doctor, subcommand("doctor")]
     | Annotated[Watch, subcommand("watch")]
     | Annotated[Twin, subcommand("twin")]
     | Annotated[Certs, subcommand("certs")]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
@@ -17,19 +17,19 @@ from rfedge.arguments import (
     SPLATS,
     Up,
     field_path,
-    max_field_bytes,
     open_drive,
     open_field,
     open_splats,
     parse_size,
+    read_splats,
 )
 from rfedge.cli.field_tiles import FieldList, FieldPublish, FieldRollback
 from rfedge.cli.field_update import FieldDisagree, FieldUpdate
 
 if TYPE_CHECKING:
-    from rfcore.camera import Camera, TileOrigin
+    from rfcore.camera import Camera
     from rfcore.field import RadianceField, SplatField
-    from rfcore.raster.gaussians import Gaussians
+    from rfcore.field.stored_splats import ImportedSplats
     from rfcore.train.levels import LevelFitConfig
     from rfcore.views import PosedPicture
     from rfedge.fields.check import Fit
@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FieldImport:
-    """Read splats: a .ply of INRIA, gsplat, nerfstudio, OpenSplat, Brush or SuperSplat, or a
-    .spz."""
+    """Read splats: a .ply of INRIA, gsplat, nerfstudio, OpenSplat, Brush, SuperSplat or
+    LichtFeld, also a compressed one, or a .spz."""
 
     splats: Annotated[Path, Positional, SPLATS]
-    """The file; properties of a .ply are found by name, text and binary alike. Axes stay those of
-    the file: a .spz that its makers' own tool made from a .ply is turned half round x."""
+    """The file, told by its content; properties of a .ply are found by name, text and binary
+    alike. What is changed or left out is said. `rfedge doctor FILE` says so without importing."""
     name: Annotated[str, arg(metavar="NAME")]
     """Name of the field; every command that takes a field knows it by this name."""
     out: Annotated[Path | None, RFF] = None
@@ -51,8 +51,9 @@ class FieldImport:
     """Replace an archive that is there already."""
     transform: Path | None = None
     """nerfstudio's dataparser_transforms.json, to bring the field back to its world."""
-    tile_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """East, north and up of the tile's origin, m, subtracted in float64."""
+    tile_origin: tuple[float, float, float] | None = None
+    """East, north and up of the tile's origin, m, subtracted in float64; default: zero, or the
+    median splat where that is farther than 10 km from it."""
     up: Up | None = None
     """Axis that points up; default: z."""
     antialiased: bool = False
@@ -69,7 +70,6 @@ class FieldImport:
         """Import, print what it is, and how long a frame of it takes here."""
         from rich.console import Console
 
-        from rfcore.camera import TileOrigin
         from rfcore.errors import InvalidInput
         from rfcore.field import FieldMetadata, SplatField, save_field
         from rfedge.fields.describe import print_levels, size_mb
@@ -79,17 +79,19 @@ class FieldImport:
         _check_out(out, ".rff")
         if out.exists() and not self.replace:
             raise InvalidInput("name", f"{out} is there already: take another name, or --replace")
-        origin = TileOrigin(*self.tile_origin)
-        splats, stated = self._splats(origin)
-        antialiased = self.antialiased or stated is True
+        if out.exists() and self.splats.exists() and out.samefile(self.splats):
+            raise InvalidInput("out", f"{out} is the file that is read: name another")
+        read = self._splats()
+        antialiased = self.antialiased or read.antialiased is True
         up = None if self.up is None else UPS[self.up]
-        metadata = FieldMetadata(self.name, origin, antialiased=antialiased, up=up)
-        field = SplatField(splats, metadata, threads=self.threads)
+        metadata = FieldMetadata(self.name, read.tile_origin, antialiased=antialiased, up=up)
+        field = SplatField(read.splats, metadata, threads=self.threads)
         field = field if self.raw else field.compressed()
         out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, out)
         print(f"{out}: field {field_id}, {field.primitives:,} splats, {size_mb(field):.2f} MB")
-        print(self._mode_line(stated))
+        for note in (*read.notes, self._mode_line(read.antialiased)):
+            print(note)
         print_levels(Console(), field, look_around(field, 1280, 720))
 
     def _mode_line(self, stated: bool | None) -> str:
@@ -101,32 +103,27 @@ class FieldImport:
             return f"not drawn antialiased: the file does not say whether to; {tries}"
         return f"{'drawn' if stated else 'not drawn'} antialiased, as the file says"
 
-    def _splats(self, origin: TileOrigin) -> tuple[Gaussians, bool | None]:
-        """Return the file's splats in the tile's frame, the most important first, and how it says
-        that they are drawn."""
+    def _splats(self) -> ImportedSplats:
+        """Return the file's splats in the tile's frame, the most important first."""
+        from rfcore.camera import TileOrigin
         from rfcore.errors import InvalidInput
         from rfcore.field.importance import most_important_first, reordered, visible_area
         from rfcore.field.similarity import moved, read_field_from_world
+        from rfcore.field.stored_splats import chosen_origin
 
         back = read_field_from_world(self.transform).inverse() if self.transform else None
-        splats, stated = self._read(origin if back is None else None)
+        origin = TileOrigin(*self.tile_origin) if self.tile_origin is not None else None
+        read = read_splats(self.splats, TileOrigin() if back else origin, self.unconfined)
+        splats, notes = read.splats, [*read.notes]
         if not len(splats):
             raise InvalidInput("splats", f"{self.splats} holds no splats")
-        if back is not None:
+        if back is None:
+            origin = read.tile_origin
+        else:
+            origin = origin or chosen_origin(back.apply(splats.means.astype(float)), notes)
             splats = moved(splats, back.localised(origin))
-        return reordered(splats, most_important_first(visible_area(splats))), stated
-
-    def _read(self, origin: TileOrigin | None) -> tuple[Gaussians, bool | None]:
-        from rfcore.field import read_splat_file
-        from rfedge.fields.confined_reader import BEST_FIRST, read_confined
-
-        max_bytes = max_field_bytes()
-        if self.unconfined:
-            return read_splat_file(self.splats, origin, max_bytes)
-        splats, stated, confinement = read_confined(self.splats, origin, max_bytes)
-        if confinement is not BEST_FIRST[0]:
-            print(f"read in a {confinement} sandbox: {BEST_FIRST[0]} does not work here")
-        return splats, stated
+        splats = reordered(splats, most_important_first(visible_area(splats)))
+        return replace(read, splats=splats, tile_origin=origin, notes=tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -141,22 +138,36 @@ class FieldExport:
     be drawn; as .spz, lossy and a tenth of the size, for viewers in a browser."""
     detail: float = 1.0
     """Share of the splats: 1, 0.5, 0.25 or 0.1."""
+    spz_version: Literal[3, 4] = 4
+    """Version of a .spz: 4 states its axes (extra spz), 3 is read by older viewers, which may
+    show it turned."""
 
     def run(self) -> None:
         """Load and export."""
+        from rfcore.camera import TileOrigin
         from rfcore.field import Quality, write_ply
         from rfcore.field.quality import splats_at_detail
         from rfcore.field.spz import write_spz
 
-        write = write_spz if self.out.suffix == ".spz" else write_ply
-        if write is write_ply:
+        is_spz = self.out.suffix == ".spz"
+        if not is_spz:
             _check_out(self.out, ".ply")
         detail = Quality(self.detail).detail
         field = open_splats(self.field, threads=1)
         splats = splats_at_detail(field.gaussians, field.levels, detail)
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        write(self.out, splats, antialiased=field.metadata.antialiased)
+        antialiased, origin = field.metadata.antialiased, field.metadata.tile_origin
+        if is_spz:
+            write_spz(self.out, splats, antialiased=antialiased, version=self.spz_version)
+        else:
+            write_ply(self.out, splats, antialiased=antialiased)
         print(f"{self.out}: {len(splats):,} splats of SH degree {splats.sh_degree}")
+        if is_spz:
+            stated = "as it states" if self.spz_version == 4 else "which version 3 cannot state"
+            print(f"axes: RDF, those of a .ply, {stated}")
+        if origin != TileOrigin():
+            place = f"{origin.east_m:.10g} {origin.north_m:.10g} {origin.up_m:.10g}"
+            print(f"positions are relative to {place} m, the tile's origin")
 
 
 @dataclass(frozen=True)

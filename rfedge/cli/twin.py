@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -121,9 +122,11 @@ class Twin:
         from rfedge.arguments import open_field
 
         if target.endswith(SPLAT_SUFFIXES):
-            splats, antialiased = read_splat_file(Path(target))
-            metadata = FieldMetadata(antialiased=antialiased is True)
-            return SplatField(splats, metadata, threads=self.threads)
+            read = read_splat_file(Path(target))
+            for note in read.notes:
+                print(note, file=sys.stderr)
+            metadata = FieldMetadata("", read.tile_origin, antialiased=read.antialiased is True)
+            return SplatField(read.splats, metadata, threads=self.threads)
         return open_field(target, threads=self.threads)
 
 

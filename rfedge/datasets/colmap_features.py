@@ -16,13 +16,13 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from rfcore.camera import Pose
-from rfcore.dataset.colmap import camera_of, parameter_count
+from rfcore.dataset.colmap import camera_of, camera_parameters, parameter_count
+from rfcore.dataset.keys import READ_MODELS, lens_model
 from rfcore.dataset.picture_header import picture_header
 from rfcore.dataset.source import SourceCamera, SourcePicture
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.extras import needs
 from rfcore.image import write_png
-from rfcore.lens import BrownLens, FisheyeLens
 
 with needs("colmap"):
     import pycolmap
@@ -55,6 +55,8 @@ class PoseSettings:
 
     def __post_init__(self) -> None:
         needed = parameter_count("model", self.model)
+        if not lens_model("model", self.model).is_read:
+            raise DatasetError(f"model: camera model {self.model} is none of {READ_MODELS}")
         if self.parameters and len(self.parameters) != needed:
             raise InvalidInput(
                 "parameters", f"{self.model} has {needed}, not {len(self.parameters)}"
@@ -62,18 +64,6 @@ class PoseSettings:
         for name in ("max_side_px", "features", "threads"):
             if getattr(self, name) < 1:
                 raise InvalidInput(name, f"{getattr(self, name)} must be at least 1")
-
-
-def camera_parameters(camera: SourceCamera) -> tuple[str, list[float]]:
-    """Return COLMAP's name of the camera's model and its parameters."""
-    k, lens = camera.intrinsics, camera.lens
-    pinhole = [k.fx_px, k.fy_px, k.cx_px, k.cy_px]
-    if isinstance(lens, FisheyeLens):
-        return "OPENCV_FISHEYE", [*pinhole, lens.k1, lens.k2, lens.k3, lens.k4]
-    if isinstance(lens, BrownLens):
-        brown = [*pinhole, lens.k1, lens.k2, lens.p1, lens.p2]
-        return ("FULL_OPENCV", [*brown, lens.k3, 0, 0, 0]) if lens.k3 else ("OPENCV", brown)
-    return "PINHOLE", pinhole
 
 
 def source_camera(camera: pycolmap.Camera) -> SourceCamera:
@@ -111,7 +101,7 @@ def add_known(root: Path, known: Sequence[SourcePicture], settings: PoseSettings
 
 
 def add_new(root: Path, names: Sequence[str], settings: PoseSettings) -> None:
-    """Add the new pictures: with the dataset's camera, or with one that is to be estimated."""
+    """Add the new pictures: with the dataset's camera, or one to be estimated for each size."""
     options = pycolmap.ImageReaderOptions()
     options.camera_model = settings.model
     options.camera_params = ",".join(map(repr, settings.parameters))
@@ -119,7 +109,11 @@ def add_new(root: Path, names: Sequence[str], settings: PoseSettings) -> None:
         cameras = database.read_all_cameras()
     if cameras and settings.camera == "dataset":
         options.existing_camera_id = _shared_camera(root, names, cameras)
-    _extract(root, names, options, settings)
+    groups: dict[tuple[int, int], list[str]] = {}
+    for name in names:
+        groups.setdefault(picture_header(root / name).size_px, []).append(name)
+    for group in groups.values():
+        _extract(root, group, options, settings)
 
 
 def match(root: Path, settings: PoseSettings) -> None:

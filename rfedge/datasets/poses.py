@@ -8,6 +8,7 @@ Alone, COLMAP's incremental mapping finds a world of its own, whose scale is not
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -66,17 +67,44 @@ def pose_dataset(
     ``tell`` is called with what is being done. Raises ``DatasetError`` when nothing can be placed
     or the lens found is none, ``InvalidInput`` when ``out`` exists.
     """
-    paths = _pictures(images, 1 if register_to is not None else MIN_PICTURES)
+    fewest = 1 if register_to is not None else MIN_PICTURES
+    paths, said = _of_one_size(images, _pictures(images, fewest), fewest, settings)
     known = read_source(register_to).pictures if register_to is not None else ()
     with whole_folder(out) as folder, TemporaryDirectory(dir=folder) as work:
         root = Path(work)
         (root / "new").mkdir()
         names = [f"new/{_copied(path, root / 'new', tell).name}" for path in paths]
-        solution = solve_poses(root, names, known, settings, tell)
+        try:
+            solution = solve_poses(root, names, known, settings, tell)
+        except DatasetError as error:
+            raise DatasetError(f"{error}{said}") from error
         _write(folder, root, names, solution)
         if register_to is None:
             _check_lens(images, folder, f"{len(solution.placed)} of {len(paths)}")
-    return _summary(out, solution)
+    return _summary(out, solution) + said
+
+
+def _of_one_size(
+    images: Path, paths: Sequence[Path], fewest: int, settings: PoseSettings
+) -> tuple[Sequence[Path], str]:
+    """Return the pictures of the size that most have where the camera's parameters are given, which
+    belong to one size; and what is said about the others."""
+    headers = {path: picture_header(path) for path in paths}
+    sizes = {path: one.orientation.size(one.size_px) for path, one in headers.items()}
+    counts = Counter(sizes.values())
+    if not settings.parameters or len(counts) == 1:
+        return paths, ""
+    ((most_px, _), *_) = counts.most_common()
+    kept = [path for path in paths if sizes[path] == most_px]
+    others = [path.name for path in paths if sizes[path] != most_px]
+    shown = ", ".join("x".join(map(str, size)) for size in counts)
+    said = (
+        f"; pictures are of {len(counts)} sizes ({shown} px), and --parameters are of one: left "
+        f"out are {', '.join(others)} (without --parameters each size gets a camera of its own)"
+    )
+    if len(kept) < fewest:
+        raise DatasetError(f"{images}: {len(kept)} pictures are left of {len(paths)}{said}")
+    return kept, said
 
 
 def _check_lens(images: Path, folder: Path, placed: str) -> None:

@@ -2,17 +2,20 @@
 
 The file is opened here and read there: ``python -m rfedge.fields.confined_reader CONFINEMENT FILE
 MAX NAME EAST NORTH UP`` confines itself, says so with one byte, and writes to its standard output
-one line (count, coefficients, antialiased or not or unsaid) and the arrays of ``Gaussians`` one
-after the other; or ``!`` and what is wrong.
+one line of JSON (``Answer``) and the arrays of ``Gaussians`` one after the other; or ``!`` and what
+is wrong.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import os
+import signal
 import subprocess
 import sys
-from dataclasses import fields
+from contextlib import suppress
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import IO, BinaryIO
 
@@ -23,8 +26,11 @@ from rfcore.camera import TileOrigin
 from rfcore.confinement.confine import Confinement, ProcessLimits, confine
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import BackendUnavailable, FieldFormatError, RfedgeError
+from rfcore.field.ply_table import printable
 from rfcore.field.splat_archive import check_decoded_size
-from rfcore.field.splat_file import check_suffix, read_open_splat_file
+from rfcore.field.splat_file import START_BYTES, read_open_splat_file, splat_format
+from rfcore.field.spz import load_zstandard, needs_zstandard
+from rfcore.field.stored_splats import ImportedSplats
 from rfcore.raster.gaussians import Gaussians
 
 BEST_FIRST = (Confinement.BUBBLEWRAP, Confinement.LANDLOCK)
@@ -33,7 +39,17 @@ READER_BYTES = 1 << 30
 READY, WRONG = b".", b"!"
 MAX_LINE_BYTES = 4096
 NUMBERS_AT_ONCE = 1 << 20
-STATED = {"unsaid": None, "antialiased": True, "default": False}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the reader says of splats, before the arrays."""
+
+    count: int
+    coefficients: int
+    antialiased: bool | None
+    origin: tuple[float, float, float]
+    notes: tuple[str, ...]
 
 
 def read_confined(
@@ -41,22 +57,24 @@ def read_confined(
     tile_origin: TileOrigin | None,
     max_bytes: int,
     best_first: tuple[Confinement, ...] = BEST_FIRST,
-) -> tuple[Gaussians, bool | None, Confinement]:
+) -> tuple[ImportedSplats, Confinement]:
     """Return what ``read_splat_file`` does, and how the reader was confined.
 
     The first of ``best_first`` that works here is used. Raises ``FieldFormatError`` for what is
     wrong with the file, ``BackendUnavailable`` where no confinement works.
     """
-    check_suffix(path)
     try:
         with path.open("rb") as file:
+            start = os.pread(file.fileno(), START_BYTES, 0)
+            splat_format(path, start)
+            if needs_zstandard(start):
+                load_zstandard()
             process, confinement = _started(path, file, tile_origin, max_bytes, best_first)
     except OSError as error:
         raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
     assert process.stdout is not None
     with process, process.stdout as answer:
-        gaussians, antialiased = _received(path, answer, max_bytes)
-    return gaussians, antialiased, confinement
+        return _received(path, process, answer, max_bytes), confinement
 
 
 def _started(
@@ -92,19 +110,37 @@ def _started(
     )
 
 
-def _received(path: Path, answer: IO[bytes], max_bytes: int) -> tuple[Gaussians, bool | None]:
+def _received(
+    path: Path, process: subprocess.Popen[bytes], answer: IO[bytes], max_bytes: int
+) -> ImportedSplats:
     line = answer.readline(MAX_LINE_BYTES)
     if line.startswith(WRONG):
-        raise FieldFormatError(line[1:].decode(errors="replace").strip())
+        raise FieldFormatError(printable(line[1:].decode(errors="replace").strip()))
     try:
-        count, coefficients, stated = line.decode("ascii").split()
-        antialiased = STATED[stated]
-        n, k = int(count), int(coefficients)
+        said = Answer(**json.loads(line))
+        n, k = int(said.count), int(said.coefficients)
         check_decoded_size(n, int(k**0.5) - 1, max_bytes)
         shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, k, 3))
-        return Gaussians(*(_array(answer, shape) for shape in shapes)), antialiased
-    except (ValueError, KeyError, EOFError) as error:
-        raise FieldFormatError(f"{path}: its reader ended before the last splat") from error
+        splats = Gaussians(*(_array(answer, shape) for shape in shapes))
+        notes = tuple(printable(str(note)) for note in said.notes)
+        antialiased = None if said.antialiased is None else bool(said.antialiased)
+        return ImportedSplats(splats, antialiased, TileOrigin(*map(float, said.origin)), notes)
+    except (ValueError, TypeError, EOFError) as error:
+        answer.close()
+        raise FieldFormatError(f"{path}: {_ended(process)}") from error
+
+
+def _ended(process: subprocess.Popen[bytes]) -> str:
+    """Say how a reader ended that did not answer as it should."""
+    status = process.wait()
+    number = -status if status < 0 else status - 128  # bubblewrap's status for a killed program
+    if number in signal.valid_signals():
+        name = signal.Signals(number).name
+        return (
+            f"its reader was killed by signal {name} ({signal.strsignal(number)}) before the last "
+            "splat; if you trust the file, give --unconfined"
+        )
+    return f"its reader ended (status {status}) before the last splat"
 
 
 def _array(answer: IO[bytes], shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -124,16 +160,25 @@ def main() -> None:
     file, max_bytes = os.fdopen(int(descriptor), "rb"), int(max_text)
     origin = TileOrigin(*map(float, offset)) if offset else None
     answer = sys.stdout.buffer
+    with suppress(BackendUnavailable):  # where it is needed, the other end has asked for it
+        load_zstandard()
+    np.linalg.inv(np.eye(2))  # OpenBLAS gets its buffer by a call that is not allowed later
     confine(Confinement(confinement), ProcessLimits(READER_BYTES + 2 * max_bytes))
     answer.write(READY)
     answer.flush()
     try:
-        splats, stated = read_open_splat_file(Path(name), file, origin, max_bytes)
+        read = read_open_splat_file(Path(name), file, origin, max_bytes)
     except RfedgeError as error:
         answer.write(WRONG + str(error).encode()[: MAX_LINE_BYTES - 2] + b"\n")
+    except MemoryError:
+        answer.write(WRONG + f"{name}: needs more memory than its reader may take\n".encode())
     else:
-        word = {value: word for word, value in STATED.items()}[stated]
-        answer.write(f"{len(splats)} {splats.sh.shape[1]} {word}\n".encode())
+        splats = read.splats
+        said = Answer(
+            *(len(splats), splats.sh.shape[1], read.antialiased),
+            *(astuple(read.tile_origin), read.notes),
+        )
+        answer.write(json.dumps(vars(said)).encode() + b"\n")
         for part in fields(splats):
             answer.write(getattr(splats, part.name).reshape(-1).view(np.uint8).data)
     answer.flush()

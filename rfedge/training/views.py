@@ -105,8 +105,10 @@ def read_views(job: Train) -> tuple[Dataset, Dataset | None]:
     elif job.holdout is not None:
         dataset, held_out = split_every(dataset, job.holdout)
     if job.points is not None:
-        points = localised(read_points(job.points), dataset.tile_origin)
-        dataset = replace(dataset, points=points)
+        given = read_points(job.points)
+        notes = (*dataset.notes, *([given.note] if given.note else []))
+        points = localised(given, dataset.tile_origin)
+        dataset = replace(dataset, points=points, notes=notes)
     dataset = replace(dataset, pictures=share_of_views(dataset.pictures, job.views_percent))
     if job.depths is not None:
         points = points_from_depth_maps(dataset.pictures, job.depths)

@@ -18,6 +18,7 @@ from rfcore.field import (
     save_field,
     write_ply,
 )
+from rfcore.field.ply_table import read_vertices, write_vertices
 from rfcore.field.similarity import Similarity, moved
 from rfcore.geodesy import Anchor
 from rfcore.image import read_rgb, write_png
@@ -91,11 +92,11 @@ def test_an_imported_ply_is_found_by_its_name_and_exported_exactly(here, splats,
     field = load_field(here / "out/fields/street.rff")
     assert (field.metadata.name, field.metadata.antialiased) == ("street", True)
     FieldExport(Path("street"), here / "back.ply").run()
-    back = read_splat_file(here / "back.ply")[0]
+    back = read_splat_file(here / "back.ply").splats
     a, b = (g.means[np.lexsort(g.means.T)] for g in (splats, back))
     np.testing.assert_array_equal(a, b, "every value survives; the order is of importance")
     FieldExport(Path("street"), here / "tenth.ply", detail=0.1).run()
-    np.testing.assert_array_equal(read_splat_file(here / "tenth.ply")[0].sh, back.sh[:20])
+    np.testing.assert_array_equal(read_splat_file(here / "tenth.ply").splats.sh, back.sh[:20])
 
 
 def test_a_field_of_nerfstudio_comes_back_to_its_world(here, splats, drive, capsys):
@@ -123,6 +124,59 @@ def test_a_tile_origin_is_taken_off_and_kept(here, splats):
     assert field.metadata.tile_origin.up_m == 3.0
     low_m = splats.means.min(axis=0).astype(np.float64) - [1, 2, 3]
     np.testing.assert_allclose(field.bounds.low_m, low_m, atol=1e-6)
+
+
+def far_ply(path: Path, splats: Gaussians) -> None:
+    """Write splats in float64, 5,000 km from zero."""
+    write_ply(path, splats)
+    table = read_vertices(path, ())
+    names = table.dtype.names or ()
+    wide = table.astype([(name, "<f8" if name in ("x", "y", "z") else "<f4") for name in names])
+    wide["x"] += 500_000.0
+    wide["y"] += 5_400_000.0
+    write_vertices(path, wide)
+
+
+def test_a_far_place_is_imported_around_an_origin_which_is_said(here, splats, capsys):
+    far_ply(here / "far.ply", splats)
+    FieldImport(here / "far.ply", "far", raw=True).run()
+    field = load_field(here / "out/fields/far.rff")
+    origin = field.metadata.tile_origin
+    assert f"tile origin {origin.east_m:.0f} {origin.north_m:.0f} " in capsys.readouterr().out
+    assert origin.north_m == pytest.approx(5_400_000, abs=5)
+    back = field.gaussians.means[:, 0].astype(float) + origin.east_m - 500_000
+    np.testing.assert_allclose(np.sort(back), np.sort(splats.means[:, 0]), atol=1e-6)
+    FieldExport(Path("far"), here / "back.ply").run()
+    assert f"relative to {origin.east_m:.10g} {origin.north_m:.10g}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("version", "axes"), [(3, "cannot state"), (4, "as it states")])
+def test_an_exported_spz_says_its_axes_and_comes_back(here, splats, capsys, version, axes):
+    save_field(SplatField(splats, FieldMetadata(antialiased=True)), here / "a.rff")
+    FieldExport(Path("a.rff"), here / "a.spz", spz_version=version).run()
+    assert axes in capsys.readouterr().out
+    FieldImport(here / "a.spz", "back", raw=True).run()
+    back = load_field(field_path("back"))
+    assert back.metadata.antialiased
+    order, order_back = (np.lexsort(np.round(g.means, 2).T) for g in (splats, back.gaussians))
+    np.testing.assert_allclose(back.gaussians.means[order_back], splats.means[order], atol=2.0**-12)
+
+
+def test_what_is_left_out_of_an_import_is_said(here, splats, capsys):
+    write_ply(here / "a.ply", splats)
+    data = (here / "a.ply").read_bytes()
+    one = splats.opacity_logits[:1].tobytes()
+    (here / "a.ply").write_bytes(data.replace(one, np.float32(np.inf).tobytes(), 3))
+    FieldImport(here / "a.ply", "a").run()
+    assert "3 of 200 splats are fully opaque" in capsys.readouterr().out
+
+
+def test_an_import_never_overwrites_its_input(here, splats):
+    write_ply(here / "a.rff", splats)
+    before = (here / "a.rff").read_bytes()
+    with pytest.raises(InvalidInput, match="is the file that is read"):
+        FieldImport(here / "a.rff", "a", out=here / "a.rff", replace=True).run()
+    assert (here / "a.rff").read_bytes() == before
 
 
 def test_info_says_what_is_known_and_what_a_frame_takes(here, splats, drive, capsys):
@@ -195,7 +249,7 @@ def test_a_field_is_looked_at_around_and_along_a_drive(here, splats, drive, caps
     ("verb", "error", "named"),
     [
         (FieldImport(Path("none.ply"), "a"), FieldFormatError, r"none\.ply: cannot be read"),
-        (FieldImport(Path("a.splat"), "a"), FieldFormatError, r"splat-transform a\.splat a\.ply"),
+        (FieldImport(Path("a.splat"), "a"), FieldFormatError, r"a\.splat: cannot be read"),
         (FieldImport(Path("empty.ply"), "a"), InvalidInput, "holds no splats"),
         (FieldImport(Path("empty.ply"), "a", out=Path("a.ply")), InvalidInput, r"end in \.rff"),
         (FieldExport(Path("a.rff"), Path("a.txt")), InvalidInput, r"end in \.ply"),

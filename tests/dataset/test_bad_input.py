@@ -198,22 +198,22 @@ FAULTS: dict[str, list[tuple[str, Fault, str]]] = {
         (
             "transforms",
             top("camera_model", "THIN_PRISM"),
-            r"frames\[0\].*camera_model 'THIN_PRISM'",
+            r"frames\[0\].*camera model THIN_PRISM is none",
         ),
         (
             "colmap_text",
-            edit_word("sparse/0/cameras.txt", 1, 1, "FOV"),
-            r"cameras\.txt: line 2: camera model FOV is none of",
+            edit_word("sparse/0/cameras.txt", 1, 1, "LENS"),
+            r"cameras\.txt: line 2: camera model LENS is none of",
         ),
         (
             "colmap_binary",
-            edit_bytes("sparse/0/cameras.bin", 12, (7).to_bytes(4, "little")),
-            r"cameras\.bin: camera 0: camera model number 7 is none of",
+            edit_bytes("sparse/0/cameras.bin", 12, (77).to_bytes(4, "little")),
+            r"cameras\.bin: camera 0: camera model number 77 is none of",
         ),
         (
             "folder",
             edit_text("camera.toml", "[camera]", "[camera]\nmodel = 'X'"),
-            r"camera_model 'X'",
+            r"camera model X is none of",
         ),
         ("kitti", edit_text("calib.txt", "P2:", "P9:"), r"calib\.txt: has no line 'P2:'"),
         ("kitti", edit_word("calib.txt", 2, 2, "0.5"), r"line 3 \(P2\): is not K \[I \| t\]"),

@@ -1,5 +1,6 @@
-"""Points of a PLY file that are damaged name the file."""
+"""Points of a PLY file: colours of any kind or none; damaged ones name the file."""
 
+import numpy as np
 import pytest
 
 from rfcore.dataset.source import read_points
@@ -17,8 +18,8 @@ HEADER = (
     [
         (HEADER.format(n=2, colour="uchar"), bytes(15), "30 bytes"),
         (HEADER.format(n=2_000_000_000, colour="uchar"), bytes(15), "30000000000 bytes"),
-        (HEADER.format(n=1, colour="char"), bytes(15), "must be uchar"),
-        (HEADER.format(n=1, colour="uchar").replace("red", "rot"), bytes(15), "no vertex.* red"),
+        (HEADER.format(n=1, colour="int"), bytes(30), "must be uchar"),
+        (HEADER.format(n=1, colour="uchar").replace(" z", " w"), bytes(15), "no vertex.* z"),
         (HEADER.format(n=1, colour="uchar"), b"\0\0\xc0\x7f" + bytes(11), "not finite"),
     ],
 )
@@ -27,3 +28,40 @@ def test_damaged_points_are_refused(tmp_path, header, rows, named):
     file.write_bytes(header.encode() + rows)
     with pytest.raises(DatasetError, match=rf"points\.ply.*{named}"):
         read_points(file)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "colour", "shown"),
+    [
+        ("u1", (1, 2, 255), (1, 2, 255)),
+        ("<u2", (0, 32768, 65535), (0, 128, 255)),
+        ("<f4", (0.0, 0.5, 1.0), (0, 128, 255)),
+        ("<f8", (0.0, 127.6, 255.0), (0, 128, 255)),
+    ],
+)
+@pytest.mark.parametrize("prefix", ["", "diffuse_"])
+def test_colours_of_any_kind_are_brought_to_bytes(tmp_path, dtype, colour, shown, prefix):
+    names = [f"{prefix}{name}" for name in ("red", "green", "blue")]
+    table = np.array(
+        [(1, 2, 3, *colour)], [(n, "<f4") for n in "xyz"] + [(n, dtype) for n in names]
+    )
+    kinds = {"u1": "uchar", "<u2": "ushort", "<f4": "float", "<f8": "double"}
+    lines = ["ply", "format binary_little_endian 1.0", "element vertex 1"]
+    lines += [
+        f"property {kinds[table.dtype[n].str.lstrip('|') if n in names else '<f4']} {n}"
+        for n in table.dtype.names
+    ]
+    file = tmp_path / "points.ply"
+    file.write_bytes("\n".join([*lines, "end_header\n"]).encode() + table.tobytes())
+    points = read_points(file)
+    assert points.rgb.tolist() == [list(shown)]
+    assert bool(points.note) == (dtype != "u1")
+
+
+def test_points_without_colours_are_grey_and_said(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n1 2 3\n"
+    (tmp_path / "points.ply").write_text(header)
+    points = read_points(tmp_path / "points.ply")
+    assert points.rgb.tolist() == [[128, 128, 128]]
+    assert "has no colours" in points.note

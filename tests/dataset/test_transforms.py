@@ -112,19 +112,17 @@ FAR = [[1, 0, 0, 7e5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     [
         (without("frames"), "'frames'"),
         (top_change("frames", []), "'frames'"),
-        (without("w"), r"frames\[0\] \(a.png\): key 'w' is missing"),
         (without("fl_x"), "key 'fl_x' is missing"),
         (top_change("h", 6.5), "'h' is 6.5"),
         (top_change("w", 0), "intrinsics.width_px: 0 px"),
         (top_change("fl_x", "wide"), "'fl_x' is 'wide', not a number"),
         (top_change("cx", math.nan), "'cx' is nan"),
-        (top_change("k4", 0.01), "distortion k4 = 0.01 does not belong to camera_model OPENCV"),
+        (top_change("k4", 0.01), "distortion k4 = 0.01 of camera_model OPENCV is not read"),
         (top_change("ftheta_p0", 0.01), "'ftheta_p0' names a lens that is not read"),
         (top_change("k1", 0.01), "lens distortion BrownLens.*k1=0.01.*undistort"),
         (top_change("is_fisheye", True), "lens distortion FisheyeLens.*undistort"),
         (top_change("applied_scale", 0), "'applied_scale' is 0"),
         (top_change("applied_transform", [[1]]), "'applied_transform' is .*, not 3x4 or 4x4"),
-        (top_change("ply_file_path", "absent.ply"), "absent.ply"),
         (frame_change("file_path", 3), r"frames\[1\]: key 'file_path'"),
         (frame_change("time", -1.0), "'time' is -1.0"),
         (frame_change("transform_matrix", MIRRORED), "left-handed"),
@@ -231,3 +229,70 @@ def test_a_smaller_size_scales_pictures_and_cameras_alike(write, content):
     assert picture.camera.project((1, 1, -4)) == pytest.approx((3.25, 0, 4))
     with pytest.raises(InvalidInput, match=r"8x6, the size of .*a\.png"):
         read_dataset(write(content), size_px=(16, 12))
+
+
+@pytest.mark.parametrize("missing", [("w", "h"), ("w",), ("h",)])
+def test_a_size_that_is_not_stated_is_the_pictures(write, content, missing):
+    for key in (*missing, "fl_x", "fl_y", "cx", "cy"):
+        del content[key]
+    content["camera_angle_x"] = math.pi / 2
+    for frame in content["frames"]:
+        frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")  # as Blender writes
+    k = read_dataset(write(content)).pictures[0].camera.intrinsics
+    assert (k.width_px, k.height_px, k.cx_px, k.cy_px) == (8, 6, 4.0, 3.0)
+    assert k.fx_px == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "images\\a.png",
+        ".\\images\\a",
+        "{folder}/images/a.png",
+        "/home/somebody/scene/images/a.png",
+        "/home/somebody/scene/images/a",
+        "C:\\data\\scene\\images\\a.png",
+    ],
+)
+def test_paths_of_windows_and_of_other_machines_lead_to_the_picture(write, content, name):
+    file = write(content)
+    (file.parent / "images").mkdir()
+    (file.parent / "a.png").rename(file.parent / "images" / "a.png")
+    content["frames"][0]["file_path"] = name.format(folder=file.parent)
+    dataset = read_dataset(write(content))
+    assert (dataset.pictures[0].read() == 10).all()
+    absolute = name[0] != "." and not name.startswith("images")
+    assert bool(dataset.changes) == absolute
+    assert not absolute or "1 of 2 pictures are named by absolute paths" in dataset.changes[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [
+        ("/home/somebody/elsewhere.png", "leaves .*no end of it is there; name files relative"),
+        ("C:\\data\\elsewhere.png", "no end of it is there"),
+        ("..\\secret.png", "leaves the dataset's folder"),
+        ("/tmp/../etc/passwd", "leaves the dataset's folder"),
+        ("images\\elsewhere.png", "is missing"),
+    ],
+)
+def test_paths_that_lead_nowhere_are_refused_by_what_they_are(write, content, name, named):
+    content["frames"][0]["file_path"] = name
+    with pytest.raises(DatasetError, match=named):
+        read_dataset(write(content))
+
+
+@pytest.mark.parametrize("name", ["absent.ply", "/home/somebody/absent.ply"])
+def test_points_that_are_not_there_stop_nothing(write, content, name):
+    content["ply_file_path"] = name
+    dataset = read_dataset(write(content))
+    assert (len(dataset.pictures), dataset.points) == (2, None)
+    assert "no points: " in dataset.changes[0]
+
+
+def test_a_lens_of_colmap_is_read_by_its_name(write, content):
+    content |= {"camera_model": "FULL_OPENCV", "k3": 0.01, "k4": 0.0}
+    assert read_dataset(write(content), distortion="undistort").changes
+    content["k4"] = 0.1
+    with pytest.raises(DatasetError, match=r"k4 = 0\.1 of camera_model FULL_OPENCV"):
+        read_dataset(write(content), distortion="undistort")

@@ -16,7 +16,10 @@ from hypothesis import strategies as st
 
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput
-from rfcore.field.spz import encode_spz, read_open_spz
+from rfcore.field.similarity import spherical_harmonics
+from rfcore.field.splat_file import read_open_splat_file
+from rfcore.field.spz import COORDINATE_SYSTEM, SYSTEMS, encode_spz
+from rfcore.field.stored_splats import ImportedSplats
 from rfcore.raster.gaussians import Gaussians
 
 HEADER = struct.Struct("<IIIBBBB")
@@ -110,8 +113,26 @@ NAME = Path("a.spz")
 SIZES = (9, 1, 3, 3, 4, 45)
 
 
-def decoded(data: bytes, max_bytes: int = 1 << 20) -> tuple[Gaussians, bool]:
-    return read_open_spz(NAME, io.BytesIO(data), None, max_bytes)
+def imported(data: bytes, max_bytes: int = 1 << 20) -> ImportedSplats:
+    return read_open_splat_file(NAME, io.BytesIO(data), None, max_bytes)
+
+
+def decoded(data: bytes, max_bytes: int = 1 << 20) -> tuple[Gaussians, bool | None]:
+    read = imported(data, max_bytes)
+    return read.splats, read.antialiased
+
+
+def with_extensions(data: bytes, *records: tuple[int, bytes]) -> bytes:
+    """A file of version 4 with records before its table."""
+    block = b"".join(struct.pack("<II", kind, len(body)) + body for kind, body in records)
+    plain = bytearray(as_version_4(data))
+    plain[14] |= 2
+    plain[16:20] = struct.pack("<I", 32 + len(block))
+    return bytes(plain[:32]) + block + bytes(plain[32:])
+
+
+def axes(number: int) -> tuple[int, bytes]:
+    return COORDINATE_SYSTEM, struct.pack("<I", number)
 
 
 def as_version_4(data: bytes) -> bytes:
@@ -179,11 +200,120 @@ def test_version_2_has_rotations_of_three_bytes():
     assert (np.abs((read.quaternions * turns).sum(axis=1)) > 0.999).all()
 
 
+def test_version_1_has_positions_of_float16():
+    given_ = random_gaussians(7, 30, 1, 9.0)
+    plain = bytearray(gzip.decompress(encode_spz(given_, antialiased=False)))
+    plain[4] = 1
+    turns = np.full((30, 3), 255, np.uint8).tobytes()
+    rest, after = plain[16 + 30 * 9 : 16 + 30 * 16], plain[16 + 30 * 20 :]
+    data = plain[:16] + given_.means.astype("<f2").tobytes() + rest + turns + after
+    read, _ = decoded(gzip.compress(bytes(data)))
+    np.testing.assert_array_equal(read.means, given_.means.astype(np.float16))
+
+
 def test_the_tiles_origin_is_taken_off_before_float32():
     data = encode_spz(random_gaussians(8, 20, 0, 4000.0), antialiased=False)
-    moved, _ = read_open_spz(NAME, io.BytesIO(data), TileOrigin(100.0, 200.0, 3.0), 1 << 20)
+    origin = TileOrigin(100.0, 200.0, 3.0)
+    moved = read_open_splat_file(NAME, io.BytesIO(data), origin, 1 << 20).splats
     here, _ = decoded(data)
     np.testing.assert_allclose(moved.means, here.means - np.float32([100, 200, 3]), atol=5e-4)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_both_versions_that_are_written_hold_the_same_and_the_fourth_states_its_axes(degree):
+    given_ = random_gaussians(6, 40, degree, 9.0)
+    read = [imported(encode_spz(given_, antialiased=True, version=v)) for v in (3, 4)]
+    assert_same(read[0].splats, read[1].splats)
+    assert [r.antialiased for r in read] == [True, True]
+    assert "states none" in read[0].notes[0]
+    assert read[1].notes == ("axes: RDF, as the file states",)
+
+
+def test_no_splats_are_a_file_of_version_4_too():
+    data = encode_spz(random_gaussians(1, 0, 2, 1.0), antialiased=False, version=4)
+    assert decoded(data)[0].sh.shape == (0, 9, 3)
+
+
+def test_degree_4_is_reduced_and_said():
+    given_ = random_gaussians(4, 12, 3, 9.0)
+    plain = gzip.decompress(encode_spz(given_, antialiased=False))
+    bands = np.frombuffer(plain, np.uint8, offset=16 + 12 * 20).reshape(12, 45)
+    wide = np.concatenate([bands, np.full((12, 27), 200, np.uint8)], axis=1)
+    head = bytearray(plain[: 16 + 12 * 20])
+    head[12] = 4
+    read = imported(gzip.compress(bytes(head) + wide.tobytes()))
+    assert_same(read.splats, decoded(gzip.compress(plain))[0])
+    assert "degree 4 are reduced to degree 3" in read.notes[1]
+
+
+def test_unknown_extensions_are_left_out_and_said():
+    data = encode_spz(random_gaussians(6, 20, 1, 9.0), antialiased=False)
+    orbit = (0xADBE0002, bytes(12))
+    read = imported(with_extensions(data, orbit, axes(6), (0x12340001, b"{}")))
+    assert_same(read.splats, decoded(data)[0])
+    assert "0xadbe0002, 0x12340001" in read.notes[1]
+    plain = bytearray(gzip.decompress(data))
+    plain[14] |= 2
+    legacy = imported(gzip.compress(bytes(plain) + struct.pack("<III", *(0xADBE0002, 4, 1))))
+    assert_same(legacy.splats, decoded(data)[0])
+
+
+TOWARDS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0)} | {
+    "F": (0, 0, 1),
+    "B": (0, 0, -1),
+}
+DIRECTIONS = np.random.default_rng(2).normal(size=(20, 3))
+
+
+def looks(g: Gaussians, turned: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Means, covariances and the colours seen along ``DIRECTIONS``, all turned."""
+    w, x, y, z = (g.quaternions / np.linalg.norm(g.quaternions, axis=1, keepdims=True)).T
+    i, j, k = np.eye(3)[:, :, None] * np.ones_like(w)
+    q = np.stack([x, y, z])
+    columns = [
+        v + 2 * w * np.cross(q, v, axis=0) + 2 * np.cross(q, np.cross(q, v, axis=0), axis=0)
+        for v in (i, j, k)
+    ]
+    axes_ = np.stack(columns, axis=2).transpose(1, 0, 2) * np.exp(g.log_scales)[:, None]
+    axes_ = turned @ axes_
+    along = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True) @ turned
+    basis = spherical_harmonics(along)[:, : g.sh.shape[1]]
+    colours = np.einsum("dk,nkc->ndc", basis, g.sh)
+    return g.means @ turned.T, axes_ @ axes_.transpose(0, 2, 1), colours
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_axes_that_are_stated_are_obeyed(name):
+    """The file's splats, turned by what its axes point to, are those that are read."""
+    given_ = random_gaussians(3, 12, 3, 9.0)
+    data = encode_spz(given_, antialiased=False)
+    stored = decoded(data)[0]
+    read = imported(with_extensions(data, axes(SYSTEMS.index(name) + 1)))
+    ply_from_file = np.array([TOWARDS[letter] for letter in name], float).T
+    for got, want in zip(looks(read.splats, np.eye(3)), looks(stored, ply_from_file), strict=True):
+        np.testing.assert_allclose(got, want, atol=1e-4 * np.abs(want).max())
+    assert f"axes: {name}, as the file states" in read.notes[0]
+
+
+def test_lichtfelds_layout_is_turned_back():
+    """It turns a .ply half round x, and says so: RUB."""
+    given_ = decoded(encode_spz(random_gaussians(3, 12, 1, 9.0), antialiased=False))[0]
+    signs = np.float32([1, -1, -1])
+    bands = np.float32([1, -1, -1, 1])[:, None]
+    turned = Gaussians(
+        given_.means * signs,
+        given_.quaternions * np.float32([1, 1, -1, -1]),
+        given_.log_scales,
+        given_.opacity_logits,
+        given_.sh * bands,
+    )
+    provenance = (0x4C460001, b'{"tool": "LichtFeld Studio"}')
+    data = encode_spz(turned, antialiased=False)
+    read = imported(with_extensions(data, axes(4), provenance)).splats
+    np.testing.assert_allclose(read.means, given_.means, atol=1e-6)
+    np.testing.assert_allclose(read.sh, given_.sh, atol=1e-2)
+    for got, want in zip(looks(read, np.eye(3)), looks(given_, np.eye(3)), strict=True):
+        np.testing.assert_allclose(got, want, atol=2e-2 * np.abs(want).max())
 
 
 def edited(at: int, value: int) -> Callable[[bytes], bytes]:
@@ -198,16 +328,16 @@ def edited(at: int, value: int) -> Callable[[bytes], bytes]:
 @pytest.mark.parametrize(
     ("edit", "named"),
     [
-        (lambda _: b"", "does not begin with NGSP"),
-        (lambda _: b"ply\n" * 20, "does not begin with NGSP"),
+        (lambda _: b"", "is empty"),
+        (lambda _: gzip.compress(b"other"), "does not begin with NGSP"),
         (lambda data: data[: len(data) // 2], "ended before|end-of-stream|ends"),
         (lambda data: gzip.compress(gzip.decompress(data)[:-1]), "ends 1 bytes before"),
         (lambda data: gzip.compress(gzip.decompress(data) + b"."), "goes on after its 20 splats"),
-        (edited(4, 1), r"version 1; 2 to 4 are read: convert .* a\.spz a\.ply$"),
-        (edited(4, 9), "version 9"),
-        (edited(12, 4), "SH degree 4"),
+        (edited(4, 9), "version 9.* export it as version 3 or 4"),
+        (edited(12, 5), "SH degree 5"),
         (edited(13, 24), "24 fraction bits"),
-        (edited(14, 2), "extensions of a vendor"),
+        (lambda data: with_extensions(data, axes(17)), "coordinate system 17"),
+        (lambda data: with_extensions(data, (5, b""))[:38], "ends 2 bytes"),
         (edited(11, 255), "take .* GB of memory, over the limit"),
         (lambda data: as_version_4(data)[:-1], "ends 1 bytes before"),
         (lambda data: as_version_4(data)[:40], "before the last splat"),

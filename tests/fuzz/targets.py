@@ -35,7 +35,7 @@ from rfcore.errors import (
 )
 from rfcore.field import render_field_view
 from rfcore.field.archive import ALIGN_BYTES, PREFIX, decode_archive
-from rfcore.field.splat_file import read_open_ply
+from rfcore.field.splat_ply import read_open_ply
 from rfcore.field.spz import read_open_spz
 from rfcore.field.store import decode_field
 from rfcore.views import FieldView
@@ -190,14 +190,14 @@ def repaired(data: bytes) -> bytes:
 def ply(data: bytes) -> None:
     """Splats of other programs."""
     with suppress(FieldFormatError):
-        read_open_ply(Path("fuzz.ply"), io.BytesIO(data), None, FEW_BYTES)
+        read_open_ply(Path("fuzz.ply"), io.BytesIO(data), FEW_BYTES)
 
 
 def spz(data: bytes) -> None:
     """Splats of other programs, compressed; as they are, then what gzip would hold."""
     for one in (data, gzip.compress(data, 0)):
         with suppress(FieldFormatError):
-            read_open_spz(Path("fuzz.spz"), io.BytesIO(one), None, FEW_BYTES)
+            read_open_spz(Path("fuzz.spz"), io.BytesIO(one), FEW_BYTES)
 
 
 def tiles(data: bytes) -> None:

@@ -1,6 +1,7 @@
 """New pictures are placed in a dataset's own world, which stays as it is."""
 
 import math
+import re
 import shlex
 import shutil
 import signal
@@ -24,7 +25,7 @@ from rfcore.image import rgb_from_colour, write_png
 from rfcore.lens import BrownLens
 from rfedge.cli import parse
 from rfedge.datasets import poses
-from rfedge.datasets.colmap_features import PoseSettings, cancellable
+from rfedge.datasets.colmap_features import DATABASE, PoseSettings, add_new, cancellable
 from rfedge.datasets.poses import PlacedPictures, pose_dataset
 from rfedge.fields.viewpoints import looking_at
 
@@ -154,6 +155,55 @@ def test_a_lens_that_no_camera_has_is_refused_and_leaves_nothing(drive, tmp_path
     with pytest.raises(DatasetError, match=r"placed 2 of 4 pictures, with a lens.*--parameters"):
         pose_dataset(pictures, tmp_path / "out", None, SETTINGS, lambda _: None)
     assert not (tmp_path / "out").exists()
+
+
+def two_sizes(folder: Path) -> Path:
+    folder.mkdir()
+    for i in range(5):
+        side = 32 if i in (1, 3) else 64
+        write_png(folder / f"{i}.png", np.zeros((side, side, 3), np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_pictures_of_another_size_than_the_given_camera_are_named(tmp_path, monkeypatch, fails):
+    """Whether they leave a gap or not."""
+
+    def solved(_root, names, *_rest):
+        assert [Path(name).stem for name in names] == ["0", "2", "4"]
+        if fails:
+            raise DatasetError("no two pictures share enough to start from")
+        camera = SourceCamera(Intrinsics(64, 64, 50.0, 50.0, 32.0, 32.0))
+        points = SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        return PlacedPictures(dict.fromkeys(names, (camera, Pose.identity())), (), points)
+
+    monkeypatch.setattr(poses, "solve_poses", solved)
+    given = PoseSettings(model="PINHOLE", parameters=(50.0, 50.0, 32.0, 32.0))
+    pictures, said = two_sizes(tmp_path / "two"), r"2 sizes \(64x64, 32x32 px\).* 1\.png, 3\.png"
+    if fails:
+        with pytest.raises(DatasetError, match=f"share enough.*{said}"):
+            pose_dataset(pictures, tmp_path / "out", None, given, lambda _: None)
+        return
+    assert re.search(said, pose_dataset(pictures, tmp_path / "out", None, given, lambda _: None))
+    few = tmp_path / "few"
+    few.mkdir()
+    for i in (0, 1, 2):
+        (pictures / f"{i}.png").rename(few / f"{i}.png")
+    with pytest.raises(DatasetError, match="2 pictures are left of 3"):
+        pose_dataset(few, tmp_path / "other", None, given, lambda _: None)
+
+
+def test_each_size_gets_a_camera_of_its_own_where_none_is_given(tmp_path):
+    two_sizes(tmp_path / "new")
+    names = [f"new/{i}.png" for i in range(5)]
+    add_new(tmp_path, names, PoseSettings(features=8, threads=1))
+    with pycolmap.Database.open(tmp_path / DATABASE) as database:
+        sizes = {camera.camera_id: camera.width for camera in database.read_all_cameras()}
+        images = database.read_all_images()
+    assert sorted(sizes.values()) == [32, 64]
+    assert {image.name: sizes[image.camera_id] for image in images} == {
+        name: 32 if name[4] in "13" else 64 for name in names
+    }
 
 
 def relative(a: SourcePicture, b: SourcePicture) -> Pose:

@@ -1,0 +1,115 @@
+"""``rfedge doctor``: what a file or folder is, what is understood of it, and what comes next."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from rfedge.arguments import is_field_file, open_field, read_splats
+
+if TYPE_CHECKING:
+    from rfcore.dataset.source import Source
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Say what a file or folder is, what is understood, changed and left out, and what comes next.
+
+    Nothing is written. What cannot be read is an error, with what to do.
+    """
+
+    path: Annotated[Path, Positional, arg(metavar="FILE|FOLDER")]
+    """Splats of any program, a field, a dataset, pictures, a video."""
+
+    def run(self) -> None:
+        """Print a line for each thing."""
+        from rfcore.errors import DatasetError, InvalidInput
+        from rfcore.field.splat_file import looks_like_splats
+
+        if not self.path.exists():
+            raise InvalidInput("path", f"there is no {self.path}")
+        try:
+            if is_field_file(self.path):
+                lines = _of_field(self.path)
+            elif looks_like_splats(self.path):
+                lines = _of_splats(self.path)
+            else:
+                lines = _of_dataset(self.path)
+            for line in lines:
+                print(line)
+        except DatasetError as error:
+            inside = [file for file in _files(self.path) if looks_like_splats(file)]
+            if not inside:
+                raise
+            commands = ", ".join(f"rfedge doctor {shlex.quote(str(file))}" for file in inside[:3])
+            raise DatasetError(
+                f"{error}; it holds {len(inside)} splat files: {commands}"
+            ) from error
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(file for file in path.glob("*") if file.is_file()) if path.is_dir() else []
+
+
+def _of_field(path: Path) -> Iterator[str]:
+    from rfedge.fields.describe import describe_field
+
+    yield f"{path}: a field"
+    for name, value in describe_field(open_field(path)):
+        yield f"{name:>13}  {value}"
+    yield f"next: rfedge field info {shlex.quote(str(path))} --drive DATASET"
+
+
+def _of_splats(path: Path) -> Iterator[str]:
+    import numpy as np
+
+    read = read_splats(path)
+    splats = read.splats
+    drawn = {None: "not stated", True: "yes", False: "no"}[read.antialiased]
+    yield f"{path}: {len(splats):,} splats of SH degree {splats.sh_degree}; antialiased: {drawn}"
+    if len(splats):
+        low, high = np.percentile(splats.means, (5, 95), axis=0)
+        sides = " x ".join(f"{side:.3g}" for side in high - low)
+        yield f"nine in ten lie within {sides} units"
+    yield from read.notes
+    name = shlex.quote(path.stem.partition(".")[0] or "field")
+    yield f"next: rfedge field import {shlex.quote(str(path))} --name {name}"
+
+
+def _of_dataset(path: Path) -> Iterator[str]:
+    from rfcore.dataset.assemble import Distortion, ReadOptions, assemble
+    from rfcore.dataset.read import read_source
+
+    source = read_source(path)
+    dataset = assemble(source, ReadOptions(distortion=Distortion.UNDISTORT))
+    yield f"{path}: a dataset of {len(source.pictures)} pictures, described by {source.file}"
+    yield from _cameras(source)
+    points = "none" if dataset.points is None else f"{len(dataset.points.xyz_m):,}"
+    rate = "without times" if dataset.rate_hz is None else f"{dataset.rate_hz:.3g} a second"
+    yield f"points: {points}; pictures: {rate}"
+    if source.sorted_out:
+        yield f"{source.sorted_out} pictures are listed but not there, and left out"
+    yield from dataset.changes
+    source.pictures[0].read()
+    quoted = shlex.quote(str(path))
+    if any(picture.camera.lens is not None for picture in source.pictures):
+        yield f"next: rfedge dataset convert {quoted} --out DATASET (without the lens)"
+    else:
+        yield f"next: rfedge train {quoted} --out FIELD.rff"
+
+
+def _cameras(source: Source) -> Iterator[str]:
+    """Yield a line for each camera: its lens, its size, its pictures."""
+    from rfcore.dataset.colmap import camera_parameters
+
+    for camera, count in Counter(picture.camera for picture in source.pictures).most_common(5):
+        model, parameters = camera_parameters(camera)
+        k = camera.intrinsics
+        shown = " ".join(f"{value:.6g}" for value in parameters)
+        yield f"{count} of {k.width_px}x{k.height_px} px: {model} {shown}"
