@@ -12,6 +12,7 @@ from rfcore.field import SplatField, save_field, write_ply
 from rfcore.field.spz import write_spz
 from rfcore.image import write_png
 from rfedge.cli import parse
+from rfedge.video import write_mp4
 from tests.dataset.conftest import GoldenScene
 from tests.field.some import make_gaussians
 
@@ -72,7 +73,7 @@ def test_what_cannot_be_read_is_an_error_with_what_to_do(tmp_path):
     (tmp_path / "pictures").mkdir()
     write_png(tmp_path / "pictures" / "a.png", np.zeros((4, 4, 3), np.uint8))
     (tmp_path / "scene.sog").write_bytes(b"PK\x03\x04" + bytes(26) + b"means_l.webp")
-    (tmp_path / "video.mp4").write_bytes(b"\0\0\0 ftypisom")
+    write_mp4(tmp_path / "video.mp4", [np.zeros((16, 16, 3), np.uint8)] * 2, 10.0)
     for name, error, said in (
         ("pictures", DatasetError, "rfedge dataset poses"),
         ("scene.sog", FieldFormatError, "npx @playcanvas/splat-transform"),

@@ -28,6 +28,7 @@ from rfedge.datasets import poses
 from rfedge.datasets.colmap_features import DATABASE, PoseSettings, add_new, cancellable
 from rfedge.datasets.poses import PlacedPictures, pose_dataset
 from rfedge.fields.viewpoints import looking_at
+from rfedge.video import write_mp4
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 SETTINGS = PoseSettings(max_side_px=640, features=1024, threads=1)
@@ -253,7 +254,7 @@ def test_too_few_pictures_are_refused(tmp_path):
 @pytest.mark.parametrize("folder", [False, True])
 def test_a_video_is_refused_with_the_commands_that_help(tmp_path, folder):
     video = tmp_path / "phone.MOV"
-    video.write_bytes(b"\0\0\0 ftypqt")
+    write_mp4(video, [np.zeros((16, 16, 3), np.uint8)] * 2, 10.0)
     with pytest.raises(DatasetError, match=r"phone\.MOV: is a video.*rfedge dataset poses"):
         pose_dataset(
             tmp_path if folder else video, tmp_path / "out", None, SETTINGS, lambda _: None

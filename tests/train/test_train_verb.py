@@ -23,6 +23,7 @@ from rfedge.training.finish import finishing_s
 from rfedge.training.loop import LoopLimits
 from rfedge.training.run import TrainingJob, train, training_result
 from rfedge.training.views import (
+from rfedge.video import write_mp4
     read_depth_m,
     read_views,
     share_of_views,
@@ -99,7 +100,7 @@ def test_a_field_too_alike_to_compress_names_the_option_that_helps(wall, tmp_pat
 
 def test_a_video_is_no_dataset_and_the_error_says_how_to_make_one(tmp_path):
     video = tmp_path / "phone.mp4"
-    video.write_bytes(b"\0\0\0 ftypisom")
+    write_mp4(video, [np.zeros((16, 16, 3), np.uint8)] * 2, 10.0)
     helps = r"phone\.mp4: is a video.*rfedge dataset poses .*phone\.mp4.*camera\.toml"
     with pytest.raises(DatasetError, match=helps):
         verb(video, tmp_path / "a.rff").run()
@@ -109,7 +110,7 @@ def test_a_video_is_no_dataset_and_the_error_says_how_to_make_one(tmp_path):
 
 def test_the_command_for_a_video_can_be_pasted_whatever_its_name(tmp_path):
     video = tmp_path / "my phone.mp4"
-    video.touch()
+    write_mp4(video, [np.zeros((16, 16, 3), np.uint8)] * 2, 10.0)
     with pytest.raises(DatasetError, match=r"dataset poses '.*/my phone\.mp4' --out"):
         DatasetConvert(video, tmp_path / "out").run()
 
