@@ -23,12 +23,12 @@ from rfedge.training.finish import finishing_s
 from rfedge.training.loop import LoopLimits
 from rfedge.training.run import TrainingJob, train, training_result
 from rfedge.training.views import (
-from rfedge.video import write_mp4
     read_depth_m,
     read_views,
     share_of_views,
     split_every,
 )
+from rfedge.video import write_mp4
 from tests.train.conftest import write_drive
 
 VIEWS = 8
