@@ -29,10 +29,8 @@ from rfcore.named_class import is_named_class
 from rfedge.samples import sample_path
 
 if TYPE_CHECKING:
-    from rfcore.camera import TileOrigin
     from rfcore.dataset import Dataset
     from rfcore.field import RadianceField, SplatField
-    from rfcore.field.stored_splats import ImportedSplats
     from rfcore.wire.nats import NatsServers
     from rfcore.wire.tls import TlsFiles
 
@@ -167,24 +165,6 @@ def open_splats(name: Path | str, *, threads: int) -> SplatField:
     if not isinstance(field, SplatField):
         raise InvalidInput("field", f"{name} is of kind '{field.metadata.kind}', not splats")
     return field
-
-
-def read_splats(
-    path: Path, tile_origin: TileOrigin | None = None, unconfined: bool = False
-) -> ImportedSplats:
-    """Read a splat file of another program in a sandbox; say so where it is not the best one.
-
-    Raises ``FieldFormatError``, and ``BackendUnavailable`` where no sandbox works.
-    """
-    from rfcore.field import read_splat_file
-    from rfedge.fields.confined_reader import BEST_FIRST, read_confined
-
-    if unconfined:
-        return read_splat_file(path, tile_origin, max_field_bytes())
-    read, confinement = read_confined(path, tile_origin, max_field_bytes())
-    if confinement is not BEST_FIRST[0]:
-        print(f"read in a {confinement} sandbox: {BEST_FIRST[0]} does not work here")
-    return read
 
 
 def _candidates(name: Path) -> Iterator[Path]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import is_field_file, open_field, read_splats
+from rfedge.arguments import is_field_file, open_field
 
 if TYPE_CHECKING:
     from rfcore.dataset.source import Source
@@ -68,6 +68,8 @@ def _of_field(path: Path) -> Iterator[str]:
 
 def _of_splats(path: Path) -> Iterator[str]:
     import numpy as np
+
+    from rfedge.fields.confined_reader import read_splats
 
     read = read_splats(path)
     splats = read.splats

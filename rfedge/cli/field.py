@@ -21,7 +21,6 @@ from rfedge.arguments import (
     open_field,
     open_splats,
     parse_size,
-    read_splats,
 )
 from rfedge.cli.field_tiles import FieldList, FieldPublish, FieldRollback
 from rfedge.cli.field_update import FieldDisagree, FieldUpdate
@@ -110,6 +109,7 @@ class FieldImport:
         from rfcore.field.importance import most_important_first, reordered, visible_area
         from rfcore.field.similarity import moved, read_field_from_world
         from rfcore.field.stored_splats import chosen_origin
+        from rfedge.fields.confined_reader import read_splats
 
         back = read_field_from_world(self.transform).inverse() if self.transform else None
         origin = TileOrigin(*self.tile_origin) if self.tile_origin is not None else None

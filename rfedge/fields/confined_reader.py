@@ -28,7 +28,12 @@ from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import BackendUnavailable, FieldFormatError, RfedgeError
 from rfcore.field.ply_table import printable
 from rfcore.field.splat_archive import check_decoded_size
-from rfcore.field.splat_file import START_BYTES, read_open_splat_file, splat_format
+from rfcore.field.splat_file import (
+    START_BYTES,
+    read_open_splat_file,
+    read_splat_file,
+    splat_format,
+)
 from rfcore.field.spz import load_zstandard, needs_zstandard
 from rfcore.field.stored_splats import ImportedSplats
 from rfcore.raster.gaussians import Gaussians
@@ -50,6 +55,23 @@ class Answer:
     antialiased: bool | None
     origin: tuple[float, float, float]
     notes: tuple[str, ...]
+
+
+def read_splats(
+    path: Path, tile_origin: TileOrigin | None = None, unconfined: bool = False
+) -> ImportedSplats:
+    """Read a splat file of another program for a command; say where its sandbox is a lesser one.
+
+    Raises ``FieldFormatError``, and ``BackendUnavailable`` where no sandbox works.
+    """
+    from rfedge.arguments import max_field_bytes  # the reader itself needs no command line
+
+    if unconfined:
+        return read_splat_file(path, tile_origin, max_field_bytes())
+    read, confinement = read_confined(path, tile_origin, max_field_bytes())
+    if confinement is not BEST_FIRST[0]:
+        print(f"read in a {confinement} sandbox: {BEST_FIRST[0]} does not work here")
+    return read
 
 
 def read_confined(
