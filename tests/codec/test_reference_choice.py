@@ -60,6 +60,18 @@ def test_a_render_that_shows_nothing_is_not_used():
     assert choose_references(FrameCosts(frame), Prediction(view), 23) == RENDER_ONLY
 
 
+def test_a_frame_without_details_is_still_predicted_from_its_render():
+    """Each block is of one grey: intra prediction leaves nothing, but has to send the grey."""
+    width, height = SIZE_PX
+    rng = np.random.default_rng(5)
+    greys = np.kron(rng.integers(90, 160, (height // 8, width // 8)), np.ones((8, 8), np.int64))
+    chroma = (np.full((height // 2, width // 2), 128, np.uint8),) * 2
+    frame = I420(greys.astype(np.uint8), *chroma)
+    render = I420((greys + rng.integers(-3, 4, greys.shape)).astype(np.uint8), *chroma)
+    chosen = choose_references(FrameCosts(frame), Prediction(wall(render)), 35)
+    assert chosen == RENDER_ONLY
+
+
 def test_what_the_last_frame_taught_comes_first():
     """The cars are not in the render; nobody moved, so the correction has them."""
     frame, view = pair(*SIZE_PX)
