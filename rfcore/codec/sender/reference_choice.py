@@ -26,9 +26,9 @@ INDEX_BITS = 1.0
 """Bits that a block pays for another reference than the first."""
 
 MEAN_BITS = 6.0
-"""Bits that intra prediction of a block pays for its mean. Without them a hazy street seemed cheaper
-without its field: in rain, at 32 to 35 dB, frames took four times the bits. Where the field is of
-another street, 10 are too many."""
+"""Bits that intra prediction of a block pays for its mean. Without them a hazy street seemed
+cheaper without its field: in rain, at 32 to 35 dB, frames took four times the bits. Where the field
+is of another street, 10 are too many."""
 
 USELESS_INTRA_RATIO = 1.2
 """A picture that costs more than this share of intra prediction does not help. P slices can also
