@@ -226,6 +226,8 @@ def picture_paths(folder: Path) -> list[Path]:
 
     Raises ``DatasetError`` for formats that are not read, and without any.
     """
+    if folder.is_file():
+        raise DatasetError(f"{folder}: is neither a folder of pictures nor a video that is read")
     files = sorted(path for path in folder.glob("*") if path.is_file())
     formats = {path: picture_format(path) for path in files}
     paths = [path for path in files if formats[path] and "dynamic_mask_" not in path.name]
