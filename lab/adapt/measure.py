@@ -246,7 +246,7 @@ class _CaseMeasuring:
         plain = self._coded(drive, OFF, case.own)
         noon, empty = self._other("noon", case.noon), self._other("empty", case.empty)
         noon_plain = None if noon is None else self._coded(noon, OFF, case.own)
-        noon_kbit, empty_off = _kbit_of(noon_plain), self._off_kbit(empty)
+        noon_kbit, empty_off = _kbit_of(noon_plain, AT_DB), self._off_kbit(empty)
         extra_ms = self._tool_ms(drive)
         for variant in (*TOOLS, *case.variants):
             path = case.variants.get(variant)
@@ -267,7 +267,7 @@ class _CaseMeasuring:
                 lowest_psnr_db=min(clip.psnr_db() for clip in done.clips),
                 x264_kbit_33db=x264_kbit,
                 recovered_percent=recovered_percent(off_kbit, noon_kbit, enough),
-                noon_bits_percent=_more_percent(noon_kbit, _kbit_of(noon_done)),
+                noon_bits_percent=_more_percent(noon_kbit, _kbit_of(noon_done, AT_DB)),
                 second_vehicle_percent=(
                     None if path is None else second_vehicle_percent(off_kbit, empty_off, kbit)
                 ),
@@ -345,7 +345,7 @@ class _CaseMeasuring:
         return perform(drive.clip(), coder, self.run.store)
 
 
-def _kbit_of(done: Performance | None, psnr_db: float = AT_DB) -> float | None:
+def _kbit_of(done: Performance | None, psnr_db: float) -> float | None:
     return None if done is None else kbit_at(psnr_db, done)
 
 
