@@ -102,7 +102,7 @@ CDF_RATE_BPS = 4e6
 """The rate whose distribution is drawn: the demo's link."""
 
 SENDER = Column("sender", sender_of)
-AHEAD = Column("pose ahead", lambda row: "yes" if row.pose_ahead else "")
+AHEAD = Column("pose ahead", lambda row: "yes" if row.pose_ahead else "no")
 WITHIN_5 = Column(
     "uplink for 99 % within 5 ms, Mbit/s", lambda row: row.uplink_bps_p99_within["5"] / 1e6, ".2f"
 )
