@@ -36,8 +36,8 @@ FAR = Camera(INTRINSICS, Pose((0.0, 0.0, -40.0), (1.0, 0.0, 0.0, 0.0)))
 
 
 @pytest.fixture(autouse=True)
-def views_wait_for_no_idle_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "work_when_idle", lambda: None)
+def views_have_the_usual_priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "VIEWS_NICE", 0)
 
 
 class Browser:

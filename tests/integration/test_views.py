@@ -313,7 +313,7 @@ async def test_a_view_that_waits_for_a_processor_costs_nothing_meanwhile(
         return compose(*arguments, **options)
 
     monkeypatch.setattr(rendering, "compose", late)
-    monkeypatch.setattr(rendering, "work_when_idle", lambda: None)
+    monkeypatch.setattr(rendering, "VIEWS_NICE", 0)
     async with serve() as server, stub_of(server) as stub:
         await stub.Render(view_request_to_wire(asked(street)))
         spent = server.registry.get_sample_value(

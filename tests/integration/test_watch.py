@@ -43,8 +43,8 @@ CAMERA = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 
 
 @pytest.fixture(autouse=True)
-def views_wait_for_no_idle_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "work_when_idle", lambda: None)
+def views_have_the_usual_priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "VIEWS_NICE", 0)
 
 
 async def next_of(call: Any) -> TwinPicture | Departure:
