@@ -110,10 +110,10 @@ async def test_a_view_that_had_to_wait_shows_what_was_fresh_when_it_was_asked_fo
     street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A busy machine draws it three seconds late, and pictures vouch for two."""
-    clock, nearest = (
-        SimpleNamespace(monotonic=time.monotonic, time_ns=time.time_ns),
-        rendering.nearest,
+    clock = SimpleNamespace(
+        monotonic=time.monotonic, time_ns=time.time_ns, thread_time=time.thread_time
     )
+    nearest = rendering.nearest
 
     def late(*args: Any) -> Any:
         clock.monotonic = lambda: time.monotonic() + 3.0
