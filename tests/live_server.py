@@ -80,11 +80,17 @@ def channel_to(address: object, tls: TlsFiles) -> grpc.aio.Channel:
 
 
 async def open_stream(channel: grpc.aio.Channel, hello: Hello, metadata: Any = ()) -> Any:
-    """Open a vehicle's stream and expect its Welcome."""
+    """Open a vehicle's stream and expect its Welcome, and credit for each camera.
+
+    gRPC tells how a stream ended only when all its messages were read.
+    """
     stream = channel.stream_stream(STREAM_METHOD)(metadata=metadata)
     await stream.write(hello_to_bytes(hello))
-    (welcome, *_) = AnswerReader().messages(await stream.read())
-    assert isinstance(welcome, Welcome)
+    reader = AnswerReader(camera.camera_id for camera in hello.cameras)
+    answers = list(reader.messages(await stream.read()))
+    assert isinstance(answers[0], Welcome)
+    while len(answers) <= len(hello.cameras):
+        answers += reader.messages(await stream.read())
     return stream
 
 
