@@ -251,8 +251,8 @@ def load_zstandard() -> None:
 def _zstandard_blocks(
     path: Path, file: BinaryIO, header: _Header, start: bytes
 ) -> tuple[list[U8], bytes]:
-    load_zstandard()
-    from zstandard import ZstdDecompressor, ZstdError
+    with needs("spz"):
+        from zstandard import ZstdDecompressor, ZstdError
 
     if len(start) < HEADER_4_BYTES:
         raise FieldFormatError(f"{path}: ends within its header of {HEADER_4_BYTES} bytes")

@@ -106,7 +106,7 @@ def config_of(
     start = "drive" if module is agent_command else "serve"
     monkeypatch.setattr(module, start, configs.append)
     monkeypatch.setattr(asyncio, "run", lambda _: None)
-    monkeypatch.setattr(module, "configure_logs", lambda *_: None)
+    monkeypatch.setattr("rfcore.wire.settings.configure_logs", lambda *_: None)
     monkeypatch.setattr(sys, "argv", words)
     module.main()
     return configs[0]

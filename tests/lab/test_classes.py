@@ -259,7 +259,7 @@ def test_missing_or_unfit_class_pictures_are_named_before_anything_is_coded(
     with pytest.raises(InvalidInput, match=r"2.png: \(48, 32\) px, frame \(96, 64\) px"):
         run_classes(job_of(thumbnail.field, named, tmp_path), Console())
     (folder / "drive/classes/2.png").unlink()
-    with pytest.raises(DatasetError, match=r"classes/2.png: not a readable picture"):
+    with pytest.raises(DatasetError, match=r"classes/2.png: cannot be read"):
         run_classes(job_of(thumbnail.field, named, tmp_path), Console())
 
 

@@ -49,7 +49,7 @@ def test_what_is_no_class_picture_is_refused_by_name(tmp_path):
         ("rgb", "has colours"),
         ("high", "level 200 is no label, at most 13"),
         ("text", "not a readable picture"),
-        ("none", "not a readable picture"),
+        ("none", "cannot be read"),
     ):
         with pytest.raises(DatasetError, match=rf"{name}.png: {said}"):
             read_classes(tmp_path / f"{name}.png")

@@ -53,6 +53,11 @@ class Watched:
             return await self.reports.get()
 
 
+@pytest.fixture(autouse=True)
+def trials_have_the_usual_priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mec_server.learner.work_when_idle", lambda: None)
+
+
 @pytest.fixture
 async def watched(noon: SplatField, dusk: SplatField) -> AsyncIterator[Watched]:
     made = Watched(noon, dusk)
