@@ -46,8 +46,8 @@ with needs("colmap"):
 Tell = Callable[[str], None]
 """Called with a line that says what is being done."""
 MIN_PICTURES = 3
-PLAIN = ("PNG", "JPEG", "WebP")
-"""Formats that COLMAP reads."""
+PLAIN = ("PNG", "JPEG")
+"""Formats that COLMAP reads; pycolmap 4.2's wheels read no WebP, without saying so."""
 ANY_FORWARD_MOTION = 1.0
 """A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
 START_ANGLES_DEG = (16.0, 2.0)
@@ -73,7 +73,10 @@ def pose_dataset(
     with whole_folder(out) as folder, TemporaryDirectory(dir=folder) as work:
         root = Path(work)
         (root / "new").mkdir()
-        names = [f"new/{_copied(path, root / 'new', tell).name}" for path in paths]
+        told: list[str] = []
+        names = [f"new/{_copied(path, root / 'new', told.append).name}" for path in paths]
+        for words, count in Counter(line.partition(": ")[2] for line in told).items():
+            tell(f"{count} of {len(paths)} pictures: {words}")
         try:
             solution = solve_poses(root, names, known, settings, tell)
         except DatasetError as error:

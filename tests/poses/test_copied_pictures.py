@@ -20,7 +20,9 @@ def test_exif_is_applied_and_said(tmp_path):
     assert told == ["a.png: turned by 90 degrees clockwise"]
 
 
-@pytest.mark.parametrize(("name", "kept"), [("a.png", True), ("a.jpg", True), ("a.tif", False)])
+@pytest.mark.parametrize(
+    ("name", "kept"), [("a.png", True), ("a.jpg", True), ("a.webp", False), ("a.tif", False)]
+)
 def test_other_formats_become_png_and_the_rest_stays_as_it_is(name, kept, tmp_path):
     cv2.imwrite(str(tmp_path / name), RGB)
     told: list[str] = []
