@@ -61,13 +61,13 @@ def test_a_job_on_ray_learns_the_same_bytes(noon, dusk, make_pass, tmp_path, mon
     save_field(noon, Path("noon.rff"))
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
     folders = tuple(recorded(Path(drive.identity), drive) for drive in passes)
-    update = FieldUpdate(Path("noon.rff"), folders, Path("here.rff"), iterations=60)
+    update = FieldUpdate(Path("noon.rff"), folders, Path("here.rff"), "colours")
     update.run()
     replace(update, out=Path("job.rff"), ray="local").run()
     assert Path("job.rff").read_bytes() == Path("here.rff").read_bytes()
     said = capsys.readouterr().out
     assert "update-job: done" in said
-    assert re.search(r"^update-job\b.*fine-tuning: 60 of 60$", said, flags=re.MULTILINE)
+    assert re.search(r"^update-job\b.*colours: \d+ of 22$", said, flags=re.MULTILINE)
     assert sorted(path.name for path in tmp_path.glob("*.job")) == []
 
 
