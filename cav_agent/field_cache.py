@@ -131,7 +131,7 @@ class FieldCache:
         tile, loop = served.tile, asyncio.get_running_loop()
         own = ArrivingField()
         preview: tuple[str, ...] = ()
-        if self._own or self._needs_all or await self._holds(tile.field_id):
+        if self._own or self._finds_poses or await self._holds(tile.field_id):
             field = await self._opened(served, (tile.field_id,))
             own.whole.set_result(field)
         elif tile.preview is not None:
@@ -200,17 +200,12 @@ class FieldCache:
 
     @property
     def _finds_poses(self) -> bool:
-        """Return whether poses are not those of the drive."""
-        return self._config.localise or self._config.feed.source is not None
+        """Return whether poses are found on the way, and are not those of the drive.
 
-    @property
-    def _needs_all(self) -> bool:
-        """Return whether a drive needs the whole of the tile's own field.
-
-        It does where a camera is searched in it on another thread (``--localise``), and where a
-        feed's positions are checked against its bounds.
+        The whole of the tile's own field is needed for it: a camera is searched in it on another
+        thread (``--localise``), and a feed's positions are checked against its bounds.
         """
-        return self._finds_poses
+        return self._config.localise or self._config.feed.source is not None
 
     async def _arrive(self, served: ServedTile, own: ArrivingField) -> None:
         """Fetch the tile's own field and have it drawn; try again until all of it is there.

@@ -46,8 +46,8 @@ _REMEDIES: dict[str, str] = {
     EndReason.STREAM_LOST: _LINK_REMEDY,
     EndReason.SERVER_CLOSED: _LINK_REMEDY,
 }
-"""What helps when no picture was acknowledged, by the reason of most; of others a server refused
-them."""
+"""Remedies when no picture was acknowledged, by the reason of most; for other reasons a server
+refused them."""
 
 JUDGED_FRAMES = 8
 """Answers of which the median time says whether the processors can keep the delay."""

@@ -80,7 +80,7 @@ class OutgoingMessage:
     message: ClientMessage
     data: bytes
     packet_bytes: int = 0
-    """Of a frame: with the pose that was sent ahead of it."""
+    """Bytes of a frame, with the pose that was sent ahead of it."""
 
 
 class AgentSession:

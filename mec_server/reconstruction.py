@@ -94,7 +94,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What was made for the next frame before it came, in ``took_ns``."""
+    """Render and references made for the next frame before it came, in ``took_ns``."""
 
     place: Place
     render: View | None

@@ -38,7 +38,7 @@ EXACT_CONVERSION = (
 OPAQUE = 250
 """From this alpha of 255 on, a pixel is taken for opaque: black behind it takes 2 %."""
 WHITE_CD_M2 = 203.0
-"""What white of HDR pictures shows, ITU-R BT.2408."""
+"""Luminance that white of HDR pictures shows, ITU-R BT.2408."""
 UNREAD = {
     ColorTrc.LOG: "logarithmic",
     ColorTrc.LOG_SQRT: "logarithmic",

@@ -260,7 +260,6 @@ class _Lines:
 
     def __init__(self) -> None:
         self._lines: list[str] = []
-
         self._begun: Counter[str] = Counter()
 
     def begin(self, name: str) -> int:

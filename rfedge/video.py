@@ -33,10 +33,9 @@ def write_mp4(path: Path, frames: Iterable[Rgb | I420], rate_hz: float) -> int:
         stream = bt709_stream(container, rate, {"crf": "16", "preset": "fast"})
         for given in frames:
             picture = given if isinstance(given, I420) else i420_from_rgb(given)
-            width, height = (side - side % 2 for side in picture.size_px)
+            frame = even_frame(picture, count)
             if not count:
-                stream.width, stream.height = width, height
-            frame = video_frame(picture.cropped((width, height)), (width, height), count)
+                stream.width, stream.height = frame.width, frame.height
             container.mux(stream.encode(frame))
             count += 1
         if count:
@@ -45,6 +44,12 @@ def write_mp4(path: Path, frames: Iterable[Rgb | I420], rate_hz: float) -> int:
         path.unlink()
         raise InvalidInput("video", f"{path}: there is no picture to write")
     return count
+
+
+def even_frame(picture: I420, pts: int) -> av.VideoFrame:
+    """Return a picture as coders of 4:2:0 take it, an odd last row or column cut off."""
+    width, height = (side - side % 2 for side in picture.size_px)
+    return video_frame(picture.cropped((width, height)), (width, height), pts)
 
 
 def bt709_stream(

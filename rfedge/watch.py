@@ -25,7 +25,6 @@ from typing import Protocol
 
 import av
 
-from rfcore.codec.h264.ffmpeg import video_frame
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.image import png_bytes
@@ -37,7 +36,7 @@ from rfcore.wire.twin import (
 )
 from rfcore.wire.values import check_name
 from rfcore.wire.waits import waiting
-from rfedge.video import bt709_stream
+from rfedge.video import bt709_stream, even_frame
 
 TICKS_PER_S = 90_000
 """Resolution of a video's times, as in MPEG systems."""
@@ -117,9 +116,7 @@ class PictureVideo:
             return
         self._last_tick = tick
         stream = self._stream = self._stream or self._open(picture)
-        width, height = (side // 2 * 2 for side in picture.planes.size_px)
-        shown = picture.planes.cropped((width, height))
-        frame = video_frame(shown, (width, height), tick)
+        frame = even_frame(picture.planes, tick)
         frame.time_base = Fraction(1, TICKS_PER_S)
         self._container.mux(stream.encode(frame))
 

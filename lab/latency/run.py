@@ -73,8 +73,8 @@ class FrameWork:
 
 @dataclass(frozen=True)
 class AheadWork:
-    """What a pose ahead of a frame changes: its bytes on the link, the sender's time until it is
-    known, and the receiver's that needs nothing else."""
+    """The bytes of a pose ahead of its frame on the link, the sender's time until it is known, and
+    the receiver's that needs nothing else."""
 
     size_bytes: int
     located_ms: float

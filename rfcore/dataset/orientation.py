@@ -73,7 +73,7 @@ class Orientation(IntEnum):
 
     @property
     def words(self) -> str:
-        """What is done to the picture."""
+        """The change in words, after "are"."""
         return WORDS[self]
 
     @property

@@ -1,4 +1,4 @@
-"""What the start of a picture file says: its format, size, alpha, orientation and colours.
+"""Reads the start of a picture file: its format, size, alpha, orientation and colours.
 
 Formats are told by content (PNG, W3C; JPEG, ITU-T T.81; WebP, RFC 9649; EXIF, CIPA DC-008). Of
 others FFmpeg decodes the picture for it. So a picture of a hostile size is refused without

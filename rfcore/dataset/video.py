@@ -109,7 +109,7 @@ class VideoIndex:
     """Width and height as stored."""
     orientation: Orientation
     notes: tuple[str, ...]
-    """What was chosen or is converted, a line each."""
+    """Choices and conversions, a line each."""
 
 
 class Video:

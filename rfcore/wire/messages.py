@@ -153,8 +153,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class PoseAhead:
-    """What is known of the next frame of a camera before it is coded: where it was taken, and how
-    the field is rendered there. Attributes are as of ``Frame``.
+    """The part of a camera's next frame that is known before it is coded: where it was taken, and
+    how the field is rendered there. Attributes are as of ``Frame``.
 
     ``base_digest`` names the earlier frame that it can be predicted from; empty: none.
     """

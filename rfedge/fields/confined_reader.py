@@ -48,7 +48,7 @@ NUMBERS_AT_ONCE = 1 << 20
 
 @dataclass(frozen=True)
 class Answer:
-    """What the reader says of splats, before the arrays."""
+    """The reader's description of splats, before the arrays."""
 
     count: int
     coefficients: int

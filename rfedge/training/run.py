@@ -366,7 +366,7 @@ def _quality(trainer: FieldTrainer, job: TrainingJob) -> HeldOut | None:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run came to, in a line. It failed if the field is no nearer to pictures than the mean
+    """A run's result in a line. The run failed if the field is no nearer to pictures than the mean
     colour of those that it was trained on; a few iterations that were asked for are no failure."""
 
     text: str
