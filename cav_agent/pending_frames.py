@@ -184,13 +184,10 @@ class FramesInFlight:
     def __contains__(self, address: FrameAddress) -> bool:
         return address in self._frames
 
-    def sent(self, address: FrameAddress, now: float) -> None:
-        """Note that a frame was sent ``now``."""
-        self._frames[address] = replace(self._frames[address], sent_s=now)
-
-    def instant_of(self, address: FrameAddress) -> int:
-        """Return the instant of a rig that a frame belongs to; 0: its camera is alone."""
-        return self._frames[address].result.capture.instant
+    def sent(self, address: FrameAddress, now: float) -> FrameResult:
+        """Note that a frame was sent ``now``; return what is known of it so far."""
+        frame = self._frames[address] = replace(self._frames[address], sent_s=now)
+        return frame.result
 
     def pop(self, address: FrameAddress) -> FrameInFlight:
         """Remove a frame."""

@@ -79,8 +79,6 @@ class OutgoingMessage:
 
     message: ClientMessage
     data: bytes
-    packet_bytes: int = 0
-    """Bytes of a frame, with the pose that was sent ahead of it."""
 
 
 class AgentSession:
@@ -238,10 +236,9 @@ class AgentSession:
         if self.state is LinkState.GREETING:
             self.failed = ProtocolError(f"the server refused this vehicle's Hello: {nack.problem}")
             return
-        epoch = max(camera.chain.epoch for camera in self._cameras.values())
-        if nack.current_epoch > epoch + MAX_EPOCH_STEP:
+        if nack.current_epoch > self.epoch + MAX_EPOCH_STEP:
             raise ProtocolError(
-                f"the server says epoch {nack.current_epoch}, and this vehicle is in {epoch}"
+                f"the server says epoch {nack.current_epoch}, and this vehicle is in {self.epoch}"
             )
         self._end_refused(replace(nack, problem=nack.problem[:MAX_PROBLEM]), now)
         camera_id = nack.address.camera_id
@@ -348,7 +345,7 @@ class AgentSession:
         writer, after = self._job_is_after
         data = writer.message(frame, after)
         payload_bytes, packet_bytes = len(encoded.packet.payload), ahead_bytes + len(data)
-        outgoing = OutgoingMessage(frame, data, packet_bytes)
+        outgoing = OutgoingMessage(frame, data)
         if self._rate_control is not None:
             self._rate_control.coded(encoded.sender_s, payload_bytes, packet_bytes)
         if encoded.crf is not None:
@@ -454,16 +451,16 @@ class AgentSession:
         self._outbox.clear()
         for entry in outgoing:
             if isinstance(entry.message, Frame):
-                self._sent(entry.message.address, entry.packet_bytes, now)
+                self._sent(entry.message.address, now)
         return outgoing
 
-    def _sent(self, address: FrameAddress, packet_bytes: int, now: float) -> None:
+    def _sent(self, address: FrameAddress, now: float) -> None:
         if address not in self._in_flight:
             return  # a Nack that names no frame ended it; it is sent since it has used its credit
-        self._in_flight.sent(address, now)
+        result = self._in_flight.sent(address, now)
         if self._rate_control is not None:
-            instant = self._in_flight.instant_of(address)
-            self._rate_control.sent(address, packet_bytes, now, instant)
+            instant = result.capture.instant
+            self._rate_control.sent(address, result.packet_bytes, now, instant)
 
     def take_results(self) -> list[FrameResult]:
         """Return, once, the pictures that came to an end."""

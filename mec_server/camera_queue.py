@@ -225,7 +225,7 @@ class SessionCameras:
             while (waiting := queue.start()) is not None:
                 yield queue, waiting
 
-    def to_prepare(self) -> Iterator[tuple[CameraQueue, PoseAhead]]:
+    def to_prepare(self) -> Iterator[PoseAhead]:
         """Take out, camera by camera, every pose that may be prepared now.
 
         One that its queue refuses is dropped: its frame, when it comes, is told why.
@@ -233,7 +233,7 @@ class SessionCameras:
         for queue in self._queues.values():
             with suppress(PacketRejected):
                 if (ahead := queue.prepare()) is not None:
-                    yield queue, ahead
+                    yield ahead
 
     def position(self, address: FrameAddress) -> tuple[int, int | None]:
         """Return the current epoch of a camera, and the last good sequence if it is of that of

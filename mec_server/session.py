@@ -275,8 +275,7 @@ class ServerSession:
         ``prepared``.
         """
         return [
-            PrepareJob(ahead, self._cameras.field_of(ahead))
-            for _, ahead in self._cameras.to_prepare()
+            PrepareJob(ahead, self._cameras.field_of(ahead)) for ahead in self._cameras.to_prepare()
         ]
 
     def prepared(self, job: PrepareJob) -> None:
@@ -326,13 +325,10 @@ class ServerSession:
         for gap in self._cameras.queue_of(job.frame).succeed():
             first = replace(address, sequence=gap.first)
             self._nack(first, RejectReason.SEQUENCE_GAP, "never arrived", gap.count)
-        times = StageTimes(
+        times = replace(
+            times,
             queue_ns=_ns(job.started_s - job.received_s),
-            render_ns=times.render_ns,
-            splice_ns=times.splice_ns,
-            decode_ns=times.decode_ns,
             total_ns=_ns(now - job.received_s),
-            ahead_ns=times.ahead_ns,
         )
         self._say(Ack(address, times, digest[:RECONSTRUCTION_DIGEST_BYTES]))
         self._answered(now)

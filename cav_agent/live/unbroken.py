@@ -15,10 +15,17 @@ from collections.abc import Iterator
 from statistics import median
 from typing import Generic, TypeVar
 
-from rfcore.codec.h264.bitstream import BitReader, nal_type, split_nals
+from rfcore.codec.h264.bitstream import (
+    NAL_IDR,
+    NAL_P,
+    NAL_SPS,
+    BitReader,
+    nal_type,
+    split_nals,
+)
 from rfcore.errors import BitstreamError
 
-SLICE, IDR, SEI, SPS = 1, 5, 6, 7
+NAL_SEI = 6
 HIGH_PROFILES = {44, 83, 86, 100, 110, 118, 122, 128, 134, 138, 139, 244}
 RECOVERY_POINT = 6
 MAX_PARSED_BYTES = 256
@@ -148,11 +155,11 @@ class FrameNumbers:
         try:
             for nal in split_nals(data):
                 kind = nal_type(nal)
-                if kind == SPS:
+                if kind == NAL_SPS:
                     self._bits, self._may_gap = _numbering(_beginning(nal))
-                elif kind == SEI:
+                elif kind == NAL_SEI:
                     recovery = _recovery_pictures(nal) if recovery is None else recovery
-                elif kind in (SLICE, IDR):
+                elif kind in (NAL_P, NAL_IDR):
                     return self._slice_follows(nal, periods), recovery
         except BitstreamError:
             self._last = None
@@ -168,7 +175,7 @@ class FrameNumbers:
         is_reference = bool(nal[0] >> 5 & 3)
         if is_reference:
             self._last = number
-        if nal_type(nal) == IDR or last is None or self._may_gap:
+        if nal_type(nal) == NAL_IDR or last is None or self._may_gap:
             return True
         if periods > (1 << self._bits) - 0.5:
             return False

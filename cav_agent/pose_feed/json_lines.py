@@ -96,7 +96,7 @@ class JsonParser:
 
     def _errors(self, values: Mapping[str, Any], time_ns: int, has_height: bool) -> Vec3:
         std_m = _stated_errors(values)
-        if self._std_m is not None and abs(time_ns - self._std_m[0]) <= FRESH_S * 1e9:
+        if self._std_m is not None and _is_fresh(self._std_m[0], time_ns):
             std_m = self._std_m[1]
         return std_m if has_height else (*std_m[:2], UNKNOWN_HEIGHT_STD_M)
 
@@ -104,11 +104,15 @@ class JsonParser:
         heading_deg, self._heading_of_next = self._heading_of_next, None
         if heading_deg is not None:
             return heading_deg, COMPASS_STD_DEG
-        if self._attitude is not None and abs(time_ns - self._attitude[0]) <= FRESH_S * 1e9:
+        if self._attitude is not None and _is_fresh(self._attitude[0], time_ns):
             return self._attitude[1], COMPASS_STD_DEG
         if "track" in values and finite("speed", values.get("speed", 0), 0, 500) > LEAST_SPEED_MPS:
             return finite("track", values["track"], 0, 360), COURSE_STD_DEG
         return None, COURSE_STD_DEG
+
+
+def _is_fresh(then_ns: int, time_ns: int) -> bool:
+    return abs(time_ns - then_ns) <= FRESH_S * 1e9
 
 
 def _own(values: Mapping[str, Any]) -> Fix:

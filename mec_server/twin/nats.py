@@ -157,13 +157,14 @@ class TwinPublisher:
 
     async def _publish_view(self, client: Client, view: ReceivedPicture) -> None:
         headers = {PLACE_HEADER: self._place(view).encode().decode()}
+        headers_bytes = header_bytes(headers)
         for encoding in self._encodings():
             data = await self._pictures.bytes_of(view, encoding)
             age_s = view.age_s(time.monotonic())
             message = picture_message(view, age_s, encoding, data, self._mailbox.skipped[view.key])
             subject = picture_subject(encoding, *view.key)
             body = twin_message_to_wire(message).SerializeToString()
-            size_bytes = header_bytes(headers) + len(body)
+            size_bytes = headers_bytes + len(body)
             if size_bytes > client.max_payload:
                 self._too_large += 1
                 log.warning("picture larger than NATS takes", vehicle=view.vehicle_id,

@@ -104,7 +104,7 @@ class DeltaDecoder:
         past = state.past(base_digest) if base_digest and self._exact else None
         if like is None or past is None or like.photometric or like.light:
             return Prediction(view)
-        prediction = Prediction.relit(view, past) if like.relit else Prediction(view, past)
+        prediction = prediction_of(like, view, past)
         prediction.pictures(like.references)
         return prediction
 
@@ -132,7 +132,7 @@ class DeltaDecoder:
             prediction = (
                 prepared
                 if prepared is not None and _fits(prepared, packet, past)
-                else (prediction_of(packet, view, past))
+                else prediction_of(packet, view, past)
             )
             pictures = _pictures(packet, prediction)
             made_ns = self._clock_ns()

@@ -27,7 +27,7 @@ as they are:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from google.protobuf.message import DecodeError
@@ -55,6 +55,7 @@ REASONS_BACK = {number: reason for reason, number in REASONS.items()}
 
 STEP_NS = 10_000
 """Times of an Ack are told in steps of this."""
+_TIMES = ("queue_ns", "ahead_ns", "render_ns", "splice_ns", "decode_ns", "total_ns")
 _UNCHANGED, _ONE_MORE, _NUMBER = range(3)
 
 
@@ -125,8 +126,9 @@ class AnswerWriter:
         else:
             bits.put(_NUMBER, 2)
             bits.number(granted)
-        last.frames = last.frames if granted is None else granted
-        steps = (round(ns / STEP_NS) for ns in _times(ack.times))
+        if granted is not None:
+            last.frames = granted
+        steps = (round(getattr(ack.times, name) / STEP_NS) for name in _TIMES)
         bits.signed_values(tuple(steps), signed=False)
         return bits.to_bytes() + ack.reconstruction_digest
 
@@ -196,13 +198,6 @@ class AnswerReader:
         address = FrameAddress(camera_id, last.epoch, last.sequence)
         ack = Ack(address, times, digest)
         return [ack, Credit(camera_id, last.frames)] if credit else [ack]
-
-
-_TIMES = ("queue_ns", "ahead_ns", "render_ns", "splice_ns", "decode_ns", "total_ns")
-
-
-def _times(times: StageTimes) -> Iterator[int]:
-    return (getattr(times, name) for name in _TIMES)
 
 
 def _welcome_from_wire(welcome: pb.Welcome) -> Welcome:

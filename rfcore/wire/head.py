@@ -167,9 +167,9 @@ class FrameWriter:
         is_ahead = self._sent_ahead[start.camera] == start
         self._sent_ahead[start.camera] = None
         means = MEANS if packet.render_block_means else 0
-        start = replace(start, is_ahead=is_ahead, flags=_light_kind(packet) | means)
+        start = replace(start, flags=_light_kind(packet) | means)
         self._heads[start.camera].add(replace(start.head, digest=packet.reconstruction_digest))
-        return _data(self._stream, start, packet)
+        return _data(self._stream, start, packet, is_ahead=is_ahead)
 
     def _start(self, ahead: PoseAhead, after: FrameAddress | None) -> HeadStart:
         camera = _place("frame.camera_id", ahead.camera_id, self._cameras)
@@ -356,9 +356,9 @@ def _check(stream: int, start: HeadStart, packet: DeltaPacket) -> int:
     return zlib.crc32(b"".join(checked), _start_check(stream, start, len(packet.light), code))
 
 
-def _data(stream: int, start: HeadStart, packet: DeltaPacket) -> bytes:
+def _data(stream: int, start: HeadStart, packet: DeltaPacket, *, is_ahead: bool) -> bytes:
     bits = BitWriter()
-    (put_start_sent_ahead if start.is_ahead else put_start)(bits, start)
+    (put_start_sent_ahead if is_ahead else put_start)(bits, start)
     bits.put(_CODE_OF[packet.references], 8)
     for number in packet.photometric:
         bits.put(number & 0xFFFF, 16)

@@ -45,6 +45,10 @@ class Head:
     digest: bytes = b""
     """The first bytes of the picture's; empty until the frame was coded."""
 
+    def ends_in(self, epoch_bits: int, sequence_bits: int) -> bool:
+        """Return whether the address has these lowest bits."""
+        return self.epoch & 15 == epoch_bits and self.sequence & 255 == sequence_bits
+
 
 class KeptHeads:
     """The last frames of one camera, the newest last."""
@@ -64,7 +68,7 @@ class KeptHeads:
     def ending_in(self, epoch_bits: int, sequence_bits: int) -> Head | None:
         """Return the newest frame whose address has these lowest bits."""
         for head in reversed(self._by_address.values()):
-            if head.sequence & 255 == sequence_bits and head.epoch & 15 == epoch_bits:
+            if head.ends_in(epoch_bits, sequence_bits):
                 return head
         return None
 
@@ -89,8 +93,13 @@ def head_of(ahead: PoseAhead, steps: PoseSteps | None, field: int, anchor: Head 
         quality=ahead.quality,
         instant=ahead.instant,
         sensing=clock_to_wire(ahead.clock) << 2 | localisation_to_wire(ahead.localisation),
-        before=None if anchor is None else (anchor.time_us, anchor.pose),
+        before=before_of(anchor),
     )
+
+
+def before_of(anchor: Head | None) -> tuple[int, PoseSteps | None] | None:
+    """Return ``Head.before`` of a frame after ``anchor``."""
+    return None if anchor is None else (anchor.time_us, anchor.pose)
 
 
 class Prediction:

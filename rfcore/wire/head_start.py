@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rfcore.camera import PoseSteps
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.field.quality import DETAILS, SCALES, Quality
 from rfcore.wire.bits import BitReader, BitWriter
-from rfcore.wire.head_prediction import Head, KeptHeads, Prediction
+from rfcore.wire.head_prediction import Head, KeptHeads, Prediction, before_of
 from rfcore.wire.messages import FrameAddress, Hello, PoseAhead
 from rfcore.wire.values import CLOCK_OF, MAX_TRANSLATION_M, STATE_OF, check_range
 
@@ -52,7 +52,6 @@ class HeadStart:
     camera: int
     head: Head
     anchor: Head | None
-    is_ahead: bool = False
     flags: int = 0
 
     @property
@@ -109,8 +108,7 @@ def put_start_sent_ahead(bits: BitWriter, start: HeadStart) -> None:
     """Write that the start was sent ahead, and the last flags."""
     bits.put(start.camera, 5)
     bits.put(_SENT_AHEAD, 2)
-    bits.put(start.head.epoch & 15, 4)
-    bits.put(start.head.sequence & 255, 8)
+    _put_lowest_bits(bits, start.head)
     bits.put(start.flags, CODING_FLAGS_BITS)
 
 
@@ -148,18 +146,14 @@ def _read_sent_ahead(
     bits: BitReader, camera_id: str, heads: KeptHeads, sent: HeadStart | None
 ) -> HeadStart:
     epoch_bits, sequence_bits = bits.take(4), bits.take(8)
-    if (
-        sent is None
-        or sent.head.epoch & 15 != epoch_bits
-        or sent.head.sequence & 255 != sequence_bits
-    ):
+    if sent is None or not sent.head.ends_in(epoch_bits, sequence_bits):
         raise FrameRefused(
             RejectReason.UNKNOWN_STATE,
             "the pose that was sent ahead of it did not arrive",
             FrameAddress(camera_id, *heads.nearest(epoch_bits, sequence_bits)),
         )
     flags = bits.take(CODING_FLAGS_BITS)
-    return HeadStart(sent.hello, sent.camera, sent.head, sent.anchor, is_ahead=True, flags=flags)
+    return replace(sent, flags=flags)
 
 
 def _read_rest(
@@ -176,7 +170,7 @@ def _read_rest(
     sensing = bits.take(4) if flags & SENSING else usual.sensing
     check_range("frame.clock", sensing >> 2, 0, max(CLOCK_OF))
     steps = None if flags & LOST else _read_pose(bits, hello, usual, time_us)
-    before = None if anchor is None else (anchor.time_us, anchor.pose)
+    before = before_of(anchor)
     head = Head(*address, time_us, steps, field, quality, instant, sensing, before)
     return HeadStart(hello, camera, head, anchor, flags=flags & (1 << CODING_FLAGS_BITS) - 1)
 
@@ -188,14 +182,18 @@ def _put_address(bits: BitWriter, head: Head, anchor: Head | None) -> None:
         bits.number(head.sequence)
     elif (head.epoch, head.sequence) == (anchor.epoch, anchor.sequence + 1):
         bits.put(_AFTER_LAST, 2)
-        bits.put(head.epoch & 15, 4)
-        bits.put(head.sequence & 255, 8)
+        _put_lowest_bits(bits, head)
     else:
         bits.put(_AFTER_NAMED, 2)
-        bits.put(anchor.epoch & 15, 4)
-        bits.put(anchor.sequence & 255, 8)
+        _put_lowest_bits(bits, anchor)
         bits.number(head.epoch - anchor.epoch)
         bits.number(head.sequence)
+
+
+def _put_lowest_bits(bits: BitWriter, head: Head) -> None:
+    """Write the end of an address, as ``Head.ends_in`` compares it."""
+    bits.put(head.epoch & 15, 4)
+    bits.put(head.sequence & 255, 8)
 
 
 def _read_address(bits: BitReader, kind: int, heads: KeptHeads) -> tuple[Head | None, int, int]:
