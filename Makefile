@@ -208,5 +208,6 @@ $(FULL): pyproject.toml lab/pyproject.toml streetgen/pyproject.toml requirements
 
 # An editable install does not rebuild C++ by itself; this does, incrementally, under build/.
 $(BUILT): $(DEMO) $(NATIVE)
+	@echo "compiling the kernels (three minutes of two cores the first time)"
 	$(BIN)/python -m pip install -q --no-build-isolation --no-deps -e .
 	touch $@

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
@@ -55,7 +56,8 @@ class DemoRun:
     def twin_command(self, out: Path) -> str:
         """Return the command that shows the field and the last drive's pictures in a browser."""
         recorded = out / "work" / DRIVES[-1] / RECORDED
-        return shlex.join(("rfedge", "twin", str(self.field), "--drive", str(recorded)))
+        program = "rfedge" if shutil.which("rfedge") else os.path.relpath(command_of("rfedge")[0])
+        return shlex.join((program, "twin", str(self.field), "--drive", str(recorded)))
 
     def require_complete(self) -> None:
         """Raise ``RfedgeError`` unless every frame was reconstructed with a matching digest."""

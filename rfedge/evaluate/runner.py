@@ -63,8 +63,10 @@ class Run:
         return result
 
     def _labelled(self, part: Table | str) -> Table | str:
-        if not self.job.quick or isinstance(part, str):
+        if not self.job.quick:
             return part
+        if isinstance(part, str):
+            return f"QUICK, not for figures. {part}"
         return replace(part, title=f"QUICK, not for figures. {part.title}".rstrip())
 
 

@@ -197,10 +197,12 @@ Parts = Callable[[Mapping[str, Any]], Iterable[Table | str]]
 
 
 def print_tables(parts: Iterable[Table | str], console: Console) -> None:
-    """Print the tables of a result; its paragraphs are for pages."""
+    """Print the tables and paragraphs of a result."""
     for part in parts:
         if isinstance(part, Table):
             part.print(console)
+        else:
+            console.print(part, markup=False, highlight=False)
 
 
 def text_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> Table:

@@ -24,7 +24,6 @@ from rfedge.evaluate.compare.measure import BEST, BEST_OF_ANY_CPU
 from rfedge.evaluate.compare.rows import compare_parts
 from rfedge.evaluate.compare.run import run_compare
 from rfedge.jobs import run_jobs
-from rfedge.report.tables import Table
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {
@@ -185,11 +184,22 @@ def test_a_quick_comparison_has_no_interval_and_names_each_method_once(compared_
 
 def test_a_quick_comparison_says_so_in_each_table_and_has_a_line_for_a_rival(compared_quickly):
     _, result, printed, _ = compared_quickly
-    tables = list(compare_parts(result))
-    assert printed.count("QUICK") == sum(isinstance(part, Table) for part in tables)
+    parts = list(compare_parts(result))
+    assert printed.count("QUICK") == len(parts)
     for setting in {row["rival_setting"] for row in result["rows"]}:
-        lines = re.findall(rf"^{setting} .*$", printed, re.MULTILINE)
+        lines = re.findall(rf"^{setting}[ *]+[-+]\d", printed, re.MULTILINE)
         assert len(lines) == 1
+
+
+def test_a_comparison_ends_with_what_each_drive_saved_in_words(compared_quickly):
+    _, result, printed, _ = compared_quickly
+    last = " ".join(printed.split())
+    for row in result["rows"]:
+        if row["rival"] == "x264-our-tools" and row["method"].startswith("rfedge-fast"):
+            direction = "fewer" if row["bd_rate_percent"] < 0 else "more"
+            percent = abs(row["bd_rate_percent"])
+            said = f"{percent:.0f} % {direction} bits than {row['rival_setting']}"
+            assert said in last[last.rindex("QUICK") :]
 
 
 def test_a_quick_comparison_says_how_many_clips_it_codes_and_how_many_are_done(compared_quickly):

@@ -61,10 +61,10 @@ class CompareRow:
     """Quality of the field's own renders against the camera."""
 
 
-SAVINGS = Column(
-    "saving at 31 / 33 / 35 dB, %",
+AT_QUALITIES = Column(
+    "bits at 31 / 33 / 35 dB, %",
     lambda row: " / ".join(
-        f"{row.saving_percent_at_db[db]:.0f}" if db in row.saving_percent_at_db else "-"
+        f"{-row.saving_percent_at_db[db]:+.0f}" if db in row.saving_percent_at_db else "-"
         for db in SAVING_AT_DB
     ),
 )
@@ -170,10 +170,11 @@ Row = TypeVar("Row", bound=CompareRow | SsimRow | BreakEvenRow | BitShareRow)
 
 
 def compare_parts(result: Result) -> Iterator[Table | str]:
-    """Yield the tables of a comparison: a row a rival for each drive, then what else was measured.
+    """Yield the tables of a comparison: a row a rival for each drive, then what else was measured,
+    and at last a sentence a drive.
 
     Of methods and windows the first is shown against every rival, the others against one; the
-    result has all rows.
+    result has all rows. In every table less than zero is fewer bits than the rival's.
     """
     compared = rows_of(CompareRow, result["rows"])
     yield from _compared_tables(compared)
@@ -187,6 +188,35 @@ def compare_parts(result: Result) -> Iterator[Table | str]:
     if bits:
         yield Table("Where the bits go, near 33.5 dB", [DRIVE, *columns(BitShareRow)], bits)
     yield from map(_foreground_line, rows_of(ForegroundRow, result.get("foreground", ())))
+    for rows in _by_drive(of_first_method(of_first_window(compared))).values() if compared else ():
+        yield _summary(rows, break_even)
+
+
+def _summary(rows: Sequence[CompareRow], break_even: Sequence[BreakEvenRow]) -> str:
+    """Return what a drive saved, in words: ``rows`` are those of one method and field."""
+    one = rows[0]
+    anchor = next(row for row in rows if row.rival == _anchor(rows))
+    best = next((row for row in rows if row.rival == BEST_OF_ANY_CPU), anchor)
+    also = ""
+    if best.rival_setting != anchor.rival_setting:
+        also = f", and {_fewer(best.bd_rate_percent)} than the strongest, {best.rival_setting}"
+    text = (
+        f"{_drive(one)}: {_fewer(anchor.bd_rate_percent)} than {anchor.rival_setting} at equal "
+        "quality ({:g}..{:g} dB)".format(*one.window_db) + f"{also}."
+    )
+    for paid in break_even:
+        if (paid.scene, paid.hz, paid.method) == (one.scene, one.hz, one.method):
+            passes = paid.passes_to_break_even
+            after = "never" if passes is None else f"after {passes:,} such drives"
+            text += (
+                f" The field has {paid.field_bytes / 1e6:.1f} MB, which are paid for {after} "
+                f"(against {paid.rival})."
+            )
+    return text
+
+
+def _fewer(bits_percent: float) -> str:
+    return f"{abs(bits_percent):.0f} % {'fewer' if bits_percent < 0 else 'more'} bits"
 
 
 def _compared_tables(compared: Sequence[CompareRow]) -> Iterator[Table | str]:
@@ -199,7 +229,7 @@ def _compared_tables(compared: Sequence[CompareRow]) -> Iterator[Table | str]:
     told = ("bd_rate_percent", "ci95")
     for name, rows in _by_drive(of_first_method(first)).items():
         rival = Column("rival", partial(_starred, rows))
-        against = columns(CompareRow, rival, *told, BOTH_ENDS, SAVINGS, SSIM, FIRST_FRAME)
+        against = columns(CompareRow, rival, *told, BOTH_ENDS, AT_QUALITIES, SSIM, FIRST_FRAME)
         once = {row.rival_setting: row for row in rows}
         yield Table(f"{name}: {ours} over {window} dB. {STARS}", against, list(once.values()))
     family = _anchor(compared)
@@ -223,7 +253,10 @@ def _compared_tables(compared: Sequence[CompareRow]) -> Iterator[Table | str]:
     )
 
 
-STARS = "*: strongest that takes no more time than ours; **: strongest of all."
+STARS = (
+    "Below zero: fewer bits. 28 / 4: ours / the rival's. "
+    "*: strongest that takes no more time than ours; **: strongest of all."
+)
 
 
 def _starred(rows: Iterable[CompareRow], shown: CompareRow) -> str:
@@ -288,8 +321,8 @@ _BREAK_EVEN = [
     Column("field MB", lambda row: row.field_bytes / 1e6, ".2f"),
     *columns(BreakEvenRow, "passes_to_break_even"),
     Column(
-        "saving after 1 / 10 / 100 passes, %",
-        lambda row: " / ".join(f"{saving:.0f}" for saving in row.saving_percent_after.values()),
+        "bits with the field, after 1 / 10 / 100 passes, %",
+        lambda row: " / ".join(f"{-saving:+.0f}" for saving in row.saving_percent_after.values()),
     ),
 ]
 
