@@ -202,7 +202,8 @@ def _summary(rows: Sequence[CompareRow], break_even: Sequence[BreakEvenRow]) -> 
         also = f", and {_fewer(best.bd_rate_percent)} than the strongest, {best.rival_setting}"
     text = (
         f"{_drive(one)}: {_fewer(anchor.bd_rate_percent)} than {anchor.rival_setting} at equal "
-        "quality ({:g}..{:g} dB)".format(*one.window_db) + f"{also}."
+        "quality ({:g}..{:g} dB)".format(*one.window_db)
+        + f"{also}."
     )
     for paid in break_even:
         if (paid.scene, paid.hz, paid.method) == (one.scene, one.hz, one.method):
