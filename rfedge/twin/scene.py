@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -152,6 +152,17 @@ class TwinScene:
         self._notes.pop(placed.tile, None)
         self._origin = self._origin or placed.field.metadata.tile_origin
         self._post_fields(now_s)
+
+    def keep(self, tiles: Collection[str], now_s: float) -> None:
+        """Take away the fields and notes of all tiles but these."""
+        gone = [i for i, placed in self._fields.items() if placed.tile not in tiles]
+        noted = self._notes.keys() - set(tiles)
+        for field_id in gone:
+            del self._fields[field_id]
+        for tile in noted:
+            del self._notes[tile]
+        if gone or noted:
+            self._post_fields(now_s)
 
     def note(self, tile: str, text: str, now_s: float) -> None:
         """Show, beside the fields, the state of one that is not there yet."""

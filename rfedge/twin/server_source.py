@@ -207,7 +207,8 @@ class ServerSource:
         self._cameras.clear()
 
     async def _follow_fields(self) -> None:
-        """Fetch each field that the server publishes, and those that replace them."""
+        """Fetch each field that the server publishes, and those that replace them; take away those
+        that it publishes no more."""
         stub = FieldServiceStub(self._client.channel)
         while True:
             try:
@@ -215,8 +216,10 @@ class ServerSource:
                 listed = await stub.ListFields(request, wait_for_ready=True)
                 self._show_tiles(listed)
                 tiles = {tile.name: tile.field_id for tile in listed.tiles}
-                for tile, field_id in (tiles or {i[:8]: i for i in listed.field_ids}).items():
+                shown = tiles or {i[:8]: i for i in listed.field_ids}
+                for tile, field_id in shown.items():
                     await self._bring(tile, field_id)
+                self._scene.keep(shown, self._clock())
             except grpc.aio.AioRpcError as error:
                 log.info("fields cannot be listed", problem=error.details())
             await asyncio.sleep(FIELDS_EVERY_S)

@@ -96,6 +96,24 @@ def test_a_new_version_of_a_tile_takes_the_place_of_the_old(wall: SplatField) ->
     assert scene.field(wall.field_id) is None
 
 
+def test_a_field_that_is_published_no_more_is_taken_away(wall: SplatField) -> None:
+    board = Board()
+    scene = TwinScene(board)
+    old, new = at(wall, 1.0), at(wall, 2.0)
+    scene.place(PlacedField(old, "old", b"x"), 0.0)
+    scene.note("never came", "being fetched", 0.0)
+    scene.place(PlacedField(new, "new", b"x"), 0.0)
+    reader = board.read(lambda: None)
+    told(reader)
+    scene.keep({"new"}, 0.0)
+    assert scene.field_ids == (new.field_id,)
+    (said,) = told(reader)
+    assert [field["tile"] for field in said["fields"]] == ["new"]
+    assert said["notes"] == []
+    scene.keep({"new"}, 0.0)
+    assert told(reader) == []
+
+
 def test_what_becomes_of_a_field_is_said_until_it_is_there(wall: SplatField) -> None:
     board = Board()
     scene = TwinScene(board)
