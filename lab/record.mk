@@ -239,7 +239,9 @@ $(PAPER)/3dgs.rff: $(PAPER)/train-640x360/transforms_train.json
 	$(RFEDGE) train $< --antialiased --limit 600000 --sky 60000 --iterations 15000 --json $(@:.rff=.json) --out $@
 $(PAPER)/ingp.rff: $(PAPER)/train-800x450/transforms_train.json
 	$(RFEDGE) train $< --kind ngp --iterations 30000 --json $(@:.rff=.json) --out $@
+# Weights: `make lpips-weights`. Without them the columns of LPIPS are left out.
+LPIPS := $(if $(wildcard out/lpips/alexnet.ckpt),--lpips-weights out/lpips)
 $(OUT)/paper.json: $(PAPER)/3dgs.rff $(PAPER)/ingp.rff $(PAPER)/empty/transforms_eval.json $(PAPER)/parked/transforms_eval.json
 	$(LAB) paper --fields 3dgs=$(PAPER)/3dgs.rff ingp=$(PAPER)/ingp.rff --sizes 300x168 500x280 720x404 1920x1080 \
 		--drives empty=$(PAPER)/empty/transforms_eval.json parked=$(PAPER)/parked/transforms_eval.json \
-		--processes $(shell nproc) --cells $(OUT)/paper --out $@
+		--processes $(shell nproc) --cells $(OUT)/paper $(LPIPS) --out $@

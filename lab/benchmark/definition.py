@@ -29,9 +29,10 @@ from rfcore.files import write_whole
 from rfcore.tables import Range, Table
 from rfedge.evaluate.clips import Clip, CodedClip, Drive, DriveName, read_drive
 from rfedge.evaluate.compare.measure import break_even_row
-from rfedge.evaluate.compare.rows import BreakEvenRow
+from rfedge.evaluate.compare.rows import DRIVE, BreakEvenRow, QualityRow
 from rfedge.evaluate.performance import Performance
 from rfedge.evaluate.rate_curve import (
+    LPIPS,
     RateCurve,
     Window,
     bd_rate_interval,
@@ -406,6 +407,9 @@ def score_parts(result: Result) -> Iterator[ScoreTable | str]:
     shown_columns = columns(BenchmarkRow, "scene", "hz", "rival", WINDOW, *FIGURES, FIRST_FRAME)
     title = f"{result['submission']['method']}: {result['benchmark']}"
     yield ScoreTable(title, shown_columns, rows)
+    by_lpips = rows_of(QualityRow, result.get(LPIPS.name, ()))
+    if by_lpips:
+        yield ScoreTable(f"By {LPIPS.title}", [DRIVE, *columns(QualityRow)], by_lpips)
     yield "\n".join(f"* {line}" for line in _remarks(result))
 
 

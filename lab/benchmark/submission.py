@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -28,7 +29,12 @@ from rfcore.image import I420, read_rgb
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.tables import Range, Table
 from rfedge.evaluate.clips import CodedClip, Drive
-from rfedge.evaluate.rivals import CodedPictures
+from rfedge.evaluate.compare.measure import quality_rows
+from rfedge.evaluate.compare.rows import QualityRow
+from rfedge.evaluate.noted_coder import FrameNotes, NotedCoder
+from rfedge.evaluate.performance import Performance
+from rfedge.evaluate.rate_curve import LPIPS
+from rfedge.evaluate.rivals import CodedPictures, Rival
 from rfedge.results import as_json
 
 SUBMISSION = "submission.json"
@@ -272,20 +278,22 @@ def check_submission(
     *,
     tell: Tell,
     check_decoder: CheckDecoder | None = None,
+    lpips: FrameNotes | None = None,
 ) -> dict[str, Any]:
     """Check a submission against its drives and return what it scores, as a result's content.
 
     ``datasets``: where drives lie that are not among the samples. ``check_decoder`` runs
-    a decoder on the packets of each point. Raises ``InvalidData`` naming what is wrong with the
+    a decoder on the packets of each point. With ``lpips`` the first anchor is coded here, too, to
+    compare by that. Raises ``InvalidData`` naming what is wrong with the
     submission, ``InvalidInput`` for a drive that is not the benchmark's or curves that cannot be
     compared, and what ``check_decoder`` does.
     """
     submission = read_submission(folder, benchmark)
-    rows, break_even, curves = [], [], []
+    rows, break_even, curves, by_lpips = [], [], [], list[QualityRow]()
     for name, points in submission.drives.items():
         drive = benchmark.drive(name).read(datasets.get(name))
         tell(f"{name}: {len(points)} points")
-        clips = [_clip(point, drive) for point in points]
+        clips = [_clip(point, drive, lpips) for point in points]
         if check_decoder is not None:
             for point in points:
                 check_decoder(point, drive, folder / PRIOR)
@@ -294,6 +302,9 @@ def check_submission(
         rows += scored[0]
         break_even += scored[1]
         curves.append(_curve(drive, points, clips))
+        if lpips is not None:
+            ours = Performance(submission.method, tuple(clips), math.inf)
+            by_lpips += _lpips_rows(drive, ours, benchmark.anchors[0], lpips)
     withheld = "stated, not checked" if submission.withheld else "not stated"
     return {
         "benchmark": benchmark.version,
@@ -307,17 +318,29 @@ def check_submission(
         "checked": [*CHECKED, *([CHECKED_BY_DECODER] if check_decoder else [])],
         "not_checked": [*([] if check_decoder else [NOT_CHECKED_WITHOUT_DECODER]), *NOT_CHECKED],
         "rows": as_json(rows),
+        LPIPS.name: as_json(by_lpips),
         "break_even": as_json(break_even),
         "curves": curves,
     }
 
 
-def _clip(point: CodedPoint, drive: Drive) -> CodedClip:
+def _lpips_rows(
+    drive: Drive, ours: Performance, anchor: Rival, lpips: FrameNotes
+) -> list[QualityRow]:
+    """Return the row against an anchor that is coded here: its recorded clips have no LPIPS."""
+    coder = NotedCoder(anchor, lpips)
+    clips = tuple(coder.code(drive.frames, drive.name.rate_hz, p) for p in anchor.points)
+    theirs = Performance(anchor.name, clips, math.inf)
+    return quality_rows(LPIPS, drive.clip(), ours, {anchor.name: [theirs]})
+
+
+def _clip(point: CodedPoint, drive: Drive, noted: FrameNotes | None) -> CodedClip:
     """Measure a point against the drive's own frames."""
     cpu_ms = float("inf") if point.cpu_ms is None else point.cpu_ms
     pictures = point.pictures(drive.frames[0].size_px)
     made = CodedPictures(point.frame_bytes, pictures, cpu_ms, float("inf"))
-    return made.measured(point.point, drive.frames)
+    notes = {} if noted is None else noted.of(pictures, drive.frames)
+    return made.measured(point.point, drive.frames, **notes)
 
 
 def _curve(drive: Drive, points: Sequence[CodedPoint], clips: Sequence[CodedClip]) -> object:

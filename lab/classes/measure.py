@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import chain
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +29,17 @@ from rfedge.evaluate.clips import (
     QUICK,
     STEADY,
     Clip,
-    ClipCoder,
     CodedClip,
     Drive,
     DriveName,
     DriveOfField,
+    Notes,
     psnr_of_mse,
 )
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
-from rfedge.evaluate.performance import BoundedCoder, perform, seconds_left
-from rfedge.evaluate.rivals import CodedPictures, x264_lowdelay, x264_with_our_tools
+from rfedge.evaluate.noted_coder import NotedCoder, PictureCoder
+from rfedge.evaluate.performance import perform, seconds_left
+from rfedge.evaluate.rivals import x264_lowdelay, x264_with_our_tools
 from rfedge.evaluate.runner import Run, coded_clip, program_version
 from rfedge.jobs import CellStore
 from rfedge.report.tables import Table, text_table
@@ -87,55 +88,30 @@ def read_groups(name: DriveName, drive: Drive) -> list[NDArray[np.uint8]]:
     return found
 
 
-class PictureCoder(ClipCoder, BoundedCoder, Protocol):
-    """A coder of clips that also shows the pictures that it decodes."""
-
-    def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
-        """Code and decode ``frames`` with low delay."""
-
-
 @dataclass(frozen=True)
-class ClassCoder:
-    """A coder whose clips have the luma's squared error of each group in their notes."""
+class ClassErrors:
+    """Notes of the luma's squared error of each group, for a ``NotedCoder``."""
 
-    coder: PictureCoder
     groups: Groups
 
     @property
-    def name(self) -> str:
-        """The coder's own."""
-        return self.coder.name
-
-    @property
-    def points(self) -> Sequence[float]:
-        """The coder's own."""
-        return self.coder.points
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """The coder's own."""
-        return self.coder.limits
-
-    @property
     def version(self) -> str:
-        """The coder's own, and the digest of the groups."""
+        """The digest of the groups."""
         digest = hashlib.sha256()
         for groups in self.groups:
             digest.update(groups.tobytes())
-        return f"{self.coder.version}; classes {digest.hexdigest()[:16]}"
+        return f"classes {digest.hexdigest()[:16]}"
 
-    def of_run(self, run: slice) -> ClassCoder:
-        """Return the coder of the frames ``run`` alone."""
-        coder = self.coder.of_run(run) if isinstance(self.coder, FieldCoder) else self.coder
-        return ClassCoder(coder, self.groups[run])
+    def of_run(self, run: slice) -> ClassErrors:
+        """Return the notes of the frames ``run`` alone."""
+        return ClassErrors(self.groups[run])
 
-    def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
-        """Code and decode ``frames``, which may be the beginning of those of the groups."""
-        made = self.coder.pictures(frames, rate_hz, point)
-        grouped = zip(made.decoded, frames, self.groups[: len(frames)], strict=True)
+    def of(self, decoded: Sequence[I420], frames: Sequence[I420]) -> Mapping[str, Notes]:
+        """Return the errors of each group; ``frames`` may be the beginning of those of the
+        groups."""
+        grouped = zip(decoded, frames, self.groups[: len(frames)], strict=True)
         errors = np.array([_group_sse(*each) for each in grouped])
-        notes = {_note(name): tuple(errors[:, i].tolist()) for i, name in enumerate(GROUPS)}
-        return made.measured(point, frames, **notes)
+        return {_note(name): tuple(errors[:, i].tolist()) for i, name in enumerate(GROUPS)}
 
 
 def _note(group: str) -> str:
@@ -266,7 +242,7 @@ class ClassComparison:
 
     clip: Clip
     groups: Groups
-    coders: Mapping[str, ClassCoder]
+    coders: Mapping[str, NotedCoder]
 
     def curves(self, store: CellStore, at_db: Sequence[float]) -> list[ClassCurve]:
         """Code what is not there yet, at points that span the qualities and the bits asked for."""
@@ -285,7 +261,7 @@ class ClassComparison:
 
     def _reaching(
         self,
-        coder: ClassCoder,
+        coder: NotedCoder,
         store: CellStore,
         clips: Sequence[CodedClip],
         wanted: tuple[float, float],
@@ -335,7 +311,9 @@ def _comparison(job: EvalClasses, given: DriveOfField) -> ClassComparison:
     rivals = (x264_with_our_tools(job.preset), x264_lowdelay(job.preset))
     coders: dict[str, PictureCoder] = {OURS: ours, **{rival.name: rival for rival in rivals}}
     return ClassComparison(
-        drive.clip(), groups, {name: ClassCoder(coder, groups) for name, coder in coders.items()}
+        drive.clip(),
+        groups,
+        {name: NotedCoder(coder, ClassErrors(groups)) for name, coder in coders.items()},
     )
 
 

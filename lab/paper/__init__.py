@@ -32,6 +32,9 @@ class EvalPaper(Experiment):
     cells: Path = Path("out/eval/paper")
     every: int = 1
     """Take every Nth frame of a drive; neighbours at 10 Hz show almost the same."""
+    lpips_weights: Path | None = None
+    """Folder of LPIPS's weights (`make lpips-weights` makes `out/lpips`); needs
+    rfedge[reference]."""
     processes: int = 1
     """Number of processes that code at once; the rows do not depend on it."""
 

@@ -4,7 +4,7 @@ The published work explains why savings fall as resolution rises by high frequen
 lost. ``residual_bands`` measures that: the luma energy of the residual in octave bands of radial
 frequency, over the camera's own in the same band; 0 is a perfect render, 1 one that might as well
 be flat there, above 1 one that does harm. Bands are in cycles a pixel, so that they mean the same
-at every size. LPIPS is not computed: its weights are not ours to ship.
+at every size. LPIPS is ``rfedge.evaluate.lpips``.
 """
 
 from __future__ import annotations

@@ -54,7 +54,10 @@ class PaperRow:
     rf_residual_bands: Sequence[float]
     """Energy of the difference over the camera's, by band of spatial frequency."""
     rf_flip: float | None = None
-    """FLIP of the render; None of controls and native renders."""
+    """FLIP of the render; None of controls and native renders, as the next two."""
+    rf_lpips: float | None = None
+    rf_lpips_vgg: float | None = None
+    """LPIPS of the render by AlexNet and VGG16, where weights were given."""
 
     @staticmethod
     def of(row: Mapping[str, Any]) -> PaperRow:
@@ -114,8 +117,12 @@ class PaperTable:
     rf_residual_bands: Sequence[Sequence[float]]
     settings: Sequence[SettingColumns]
     rf_flip: Sequence[float] | None = None
+    rf_lpips: Sequence[float] | None = None
+    rf_lpips_vgg: Sequence[float] | None = None
 
 
+DISTANCES = ("rf_flip", "rf_lpips", "rf_lpips_vgg")
+"""Columns of a table that not every table has."""
 OF_A_SETTING = (
     "header_bytes",
     "i_psnr_db",
@@ -164,7 +171,7 @@ def _table_of(group: Sequence[PaperRow]) -> PaperTable:
         rf_psnr_db=_rounded(of_frames, "rf_psnr_db"),
         rf_ssim=_rounded(of_frames, "rf_ssim"),
         rf_residual_bands=[[round(band, 5) for band in r.rf_residual_bands] for r in of_frames],
-        rf_flip=None if first.rf_flip is None else _rounded(of_frames, "rf_flip"),
+        **{n: _rounded(of_frames, n) for n in DISTANCES if getattr(first, n) is not None},
         settings=[_columns_of(rows) for rows in by_setting.values()],
     )
 
@@ -208,7 +215,7 @@ def _rows_of_table(table: PaperTable) -> list[PaperRow]:
                     rf_psnr_db=table.rf_psnr_db[n],
                     rf_ssim=table.rf_ssim[n],
                     rf_residual_bands=table.rf_residual_bands[n],
-                    rf_flip=None if table.rf_flip is None else table.rf_flip[n],
+                    **{d: v[n] for d in DISTANCES if (v := getattr(table, d)) is not None},
                     **{name: getattr(setting, name)[n] for name in OF_A_SETTING},
                 )
             )
@@ -240,6 +247,8 @@ class PaperMean:
     rf_psnr_db: float = field(metadata=shown("RF dB", ".2f"))
     rf_ssim: float = field(metadata=shown("SSIM", ".3f"))
     rf_flip: float | None = field(metadata=shown("FLIP", ".3f"))
+    rf_lpips: float | None = field(metadata=shown("LPIPS", ".3f"))
+    rf_lpips_vgg: float | None = field(metadata=shown("LPIPS, VGG16", ".3f"))
     bands: tuple[float, ...]
     second_not_p: float
 
@@ -271,7 +280,6 @@ def _mean(group: Sequence[PaperRow]) -> PaperMean:
     first = group[0]
     savings = _by_frame([(row.frame, row.savings_percent) for row in group])
     sd = float(np.std(savings, ddof=1)) if len(savings) > 1 else 0.0
-    flips = [(row.frame, row.rf_flip) for row in group if row.rf_flip is not None]
     return PaperMean(
         name=first.field,
         scene=first.scene,
@@ -284,10 +292,15 @@ def _mean(group: Sequence[PaperRow]) -> PaperMean:
         against_intra_percent=_against_intra_percent(group),
         rf_psnr_db=float(np.mean(_by_frame([(row.frame, row.rf_psnr_db) for row in group]))),
         rf_ssim=float(np.mean(_by_frame([(row.frame, row.rf_ssim) for row in group]))),
-        rf_flip=float(np.mean(_by_frame(flips))) if flips else None,
+        **{name: _mean_distance(group, name) for name in DISTANCES},
         bands=tuple(np.mean([row.rf_residual_bands for row in group], axis=0).tolist()),
         second_not_p=float(np.mean([row.second_type != "P" for row in group])),
     )
+
+
+def _mean_distance(group: Sequence[PaperRow], name: str) -> float | None:
+    values = [(row.frame, v) for row in group if (v := getattr(row, name)) is not None]
+    return float(np.mean(_by_frame(values))) if values else None
 
 
 def _against_intra_percent(group: Sequence[PaperRow]) -> float | None:
@@ -337,8 +350,9 @@ def paper_parts(result: Result) -> Iterator[Table | str]:
     same = (*NAMES, SIZE, "making")
     savings = ("savings_percent", "sd_percent", "ci95_percent", "against_intra_percent")
     yield Table("Published metric", columns(PaperMean, *same, *savings), means)
-    quality = ("rf_psnr_db", "rf_ssim", "rf_flip", BANDS_TEXT)
-    yield Table("Renders against the camera", columns(PaperMean, *same, *quality), means)
+    measured = [n for n in DISTANCES if any(getattr(mean, n) is not None for mean in means)]
+    quality = columns(PaperMean, *same, "rf_psnr_db", "rf_ssim", *measured, BANDS_TEXT)
+    yield Table("Renders against the camera", quality, means)
     bands = ", ".join("{:.3g}..{:.3g}".format(*band) for band in result["bands_cycles_per_px"])
     frames = ", ".join(map(str, dict.fromkeys(mean.frames for mean in means)))
     yield "Camera and renders of the first frames: [views](figures/fig2_views.svg)."

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from time import monotonic
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -56,6 +56,8 @@ from rfedge.evaluate.savings import (
 )
 from rfedge.jobs import CellStore, Job, Rows, Tell
 
+if TYPE_CHECKING:
+    from rfedge.evaluate.lpips import Lpips
 with needs("eval"):
     import cv2
 
@@ -203,6 +205,8 @@ class Shot:
     opened: NamedField
     size_px: Size
     controlled: bool
+    lpips: Sequence[Lpips]
+    """Networks to compare the render with the camera by, AlexNet first; or none."""
 
 
 def named_path(text: str) -> tuple[str, Path]:
@@ -234,7 +238,7 @@ def run_paper(job: EvalPaper, console: Console) -> dict[str, Any]:
     rows = [row for shot in shots for row in run.store.rows(_key(shot), _maker(shot))]
     content = {
         "field_ids": {opened.name: opened.field.field_id for opened in fields},
-        "lpips": "n/a: no weights",
+        "lpips": "by AlexNet and VGG16" if job.lpips_weights else "n/a: no weights",
         "bands_cycles_per_px": BANDS,
         "tables": paper_tables([PaperRow.of(row) for row in rows]),
     }
@@ -278,6 +282,11 @@ def views_of(job: EvalPaper) -> list[tuple[str, Rgb]]:
 
 
 def _shots(job: EvalPaper, fields: Sequence[NamedField]) -> Iterator[Shot]:
+    lpips: list[Lpips] = []
+    if job.lpips_weights is not None:
+        from rfedge.evaluate.lpips import SHA256, Lpips
+
+        lpips = [Lpips(job.lpips_weights, network) for network in SHA256]
     for scene, path in map(named_path, job.drives):
         pictures: Sequence[PosedPicture] = read_dataset(path).pictures[:: job.every]
         if job.quick:
@@ -287,7 +296,7 @@ def _shots(job: EvalPaper, fields: Sequence[NamedField]) -> Iterator[Shot]:
             for opened in fields:
                 for size_px in job.sizes_px:
                     controlled = size_px != max(job.sizes_px) or len(job.sizes_px) == 1
-                    yield Shot(frame, opened, size_px, controlled)
+                    yield Shot(frame, opened, size_px, controlled, lpips)
 
 
 def _key(shot: Shot) -> dict[str, str | float | int | None]:
@@ -300,6 +309,7 @@ def _key(shot: Shot) -> dict[str, str | float | int | None]:
         "width": shot.size_px[0],
         "height": shot.size_px[1],
         "controlled": shot.controlled,
+        "lpips": "; ".join(each.version for each in shot.lpips),
         "program": program_version("lab/paper"),
     }
 
@@ -317,9 +327,12 @@ def _rows(shot: Shot) -> Iterator[dict[str, Any]]:
     ]
     frame = _published_frame(shot, shot.source.picture.camera)
     size_px = shot.size_px
-    difference = flip(frame.render(size_px, "downscaled"), reduced(frame.camera, size_px))
+    pair = frame.render(size_px, "downscaled"), reduced(frame.camera, size_px)
+    names = ("rf_lpips", "rf_lpips_vgg")
+    distances = dict(zip(names, (each.distance(*pair) for each in shot.lpips), strict=False))
+    distances["rf_flip"] = flip(*pair)
     for row in _labelled(shot, shot.opened.name, frame, settings):
-        yield row if row["render"] == "native" else {**row, "rf_flip": difference}
+        yield row if row["render"] == "native" else {**row, **distances}
     if shot.controlled:
         yield from _control_rows(shot)
 

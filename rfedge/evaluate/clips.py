@@ -66,6 +66,10 @@ class CodedClip:
         """Return the luma PSNR of the mean squared error over ``frames``; inf if that is 0."""
         return psnr_of_mse(float(self.luma_mse[frames].mean()))
 
+    def values(self, quality: str) -> NDArray[np.float64]:
+        """Return a quality of each frame by its name: ``ssim``, or one of the notes."""
+        return self.ssim if quality == "ssim" else np.array(self.notes[quality], np.float64)
+
     def bytes_per_frame(self, frames: slice = STEADY) -> float:
         """Return the mean size of a frame of ``frames``."""
         return float(self.frame_bytes[frames].mean())

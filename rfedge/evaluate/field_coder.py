@@ -38,7 +38,6 @@ from rfedge.offline import (
     CAMERA_ID,
     OFFLINE_VEHICLE,
     Arrival,
-    CodedFrame,
     FrameInput,
     decode_promised,
     encode_frames,
@@ -182,26 +181,10 @@ class FieldCoder:
         The clip may be the beginning of the one that was rendered. Raises ``InvalidInput`` for a
         longer one, ``CodecError`` if a receiver does not see what the sender promised.
         """
-        coded, made, messages = self._coded(frames, rate_hz, point)
-        packets = [coded_frame.encoded.packet for coded_frame in coded]
-        notes: dict[str, Notes] = {
-            "references": tuple(references_name(packet.references) for packet in packets),
-            "slice_bytes": tuple(len(packet.payload) for packet in packets),
-            "relit": tuple(float(packet.relit) for packet in packets),
-            "message": tuple(map(_digest_of, messages)),
-        }
-        if self._foregrounds:
-            masked = zip(made.decoded, frames, self._foregrounds, strict=False)
-            notes["foreground_sse"] = tuple(luma_sse(*each) for each in masked)
-        return made.measured(point, frames, **notes)
+        return self.pictures(frames, rate_hz, point).measured(point, frames)
 
     def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
         """Return what ``code`` measures; takes and raises the same."""
-        return self._coded(frames, rate_hz, point)[1]
-
-    def _coded(
-        self, frames: Sequence[I420], rate_hz: float, point: float
-    ) -> tuple[Sequence[CodedFrame], CodedPictures, Sequence[bytes]]:
         count = len(self._rendered.views)
         if not 0 < len(frames) <= count:
             raise InvalidInput("frames", f"{len(frames)} are outside the 1..{count} rendered")
@@ -218,7 +201,17 @@ class FieldCoder:
         messages = [writer.message(frame.arrival) for frame in coded]
         sizes = [len(message) for message in messages]
         both_ms = cpu_ms + render_cpu_ms, receiver_cpu_ms + render_cpu_ms
-        return coded, CodedPictures(sizes, decoded, *both_ms), messages
+        packets = [coded_frame.encoded.packet for coded_frame in coded]
+        notes: dict[str, Notes] = {
+            "references": tuple(references_name(packet.references) for packet in packets),
+            "slice_bytes": tuple(len(packet.payload) for packet in packets),
+            "relit": tuple(float(packet.relit) for packet in packets),
+            "message": tuple(map(_digest_of, messages)),
+        }
+        if self._foregrounds:
+            masked = zip(decoded, frames, self._foregrounds, strict=False)
+            notes["foreground_sse"] = tuple(luma_sse(*each) for each in masked)
+        return CodedPictures(sizes, decoded, *both_ms, notes)
 
     def _inputs(self, frames: Sequence[I420]) -> Iterator[FrameInput]:
         for index, frame in enumerate(frames):

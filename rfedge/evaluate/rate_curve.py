@@ -4,7 +4,7 @@ The distortion of a clip is the PSNR of the mean squared error over its frames (
 PSNRs, which lets one easy frame outweigh a hard one). Between points, log(rate) is interpolated
 over decibels by a monotone cubic (PCHIP; Bjontegaard, VCEG-M33, with the interpolation of
 JVET-M0166). There is no extrapolation: a window that a curve does not span is an error. A curve
-over SSIM has -10 log10(1 - SSIM) for decibels.
+over another ``Quality`` has its distance from equal pictures, as -10 log10, for decibels.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Window = tuple[float, float]
 class RateCurve:
     """Points of a rate-distortion curve, ascending: ``bytes_per_frame`` over ``psnr_db``, [N].
 
-    ``psnr_db`` is SSIM in decibels where a curve is over SSIM.
+    ``psnr_db`` is another quality in decibels where a curve is over that.
     """
 
     psnr_db: NDArray[np.float64]
@@ -98,15 +98,41 @@ def rate_curve(
     return _curve(psnr_db, clips, frames, least_points)
 
 
-def ssim_db(ssim: float) -> float:
-    """Return an SSIM below 1 in decibels: 0.9 is 10 dB."""
-    return -10 * math.log10(1 - ssim)
+@dataclass(frozen=True)
+class Quality:
+    """A quality of pictures beside the PSNR: its name in results and ``CodedClip.values``, its
+    value for equal pictures, and the window of means over the frames that is compared over."""
+
+    name: str
+    title: str
+    of_equal: float
+    window: tuple[float, float]
+    """Its worst and its best mean."""
+
+    def db(self, mean: float) -> float:
+        """Return a mean in decibels: an SSIM of 0.9 and an LPIPS of 0.1 are 10 dB."""
+        return -10 * math.log10(abs(self.of_equal - mean))
+
+    @property
+    def window_db(self) -> Window:
+        """The window in decibels."""
+        worst, best = self.window
+        return self.db(worst), self.db(best)
+
+    def curve(
+        self,
+        clips: Sequence[CodedClip],
+        frames: NDArray[np.intp] | slice,
+        least_points: int = MIN_POINTS,
+    ) -> RateCurve:
+        """Return the curve over the mean of the frames, in decibels; raises as ``rate_curve``."""
+        qualities = [self.db(float(clip.values(self.name)[frames].mean())) for clip in clips]
+        return _curve(np.array(qualities), clips, frames, least_points)
 
 
-def ssim_curve(clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice) -> RateCurve:
-    """Return the same over the mean SSIM of the frames, in decibels."""
-    qualities = [ssim_db(float(clip.ssim[frames].mean())) for clip in clips]
-    return _curve(np.array(qualities), clips, frames)
+SSIM = Quality("ssim", "SSIM", 1.0, (0.88, 0.92))
+LPIPS = Quality("lpips", "LPIPS (AlexNet)", 0.0, (0.15, 0.1))
+"""Windows about where the streets at hand have 33 to 35 dB."""
 
 
 def _curve(

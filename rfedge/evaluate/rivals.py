@@ -66,15 +66,18 @@ os.environ.setdefault("SVT_LOG", "1")  # read when the library opens: errors onl
 
 @dataclass(frozen=True)
 class CodedPictures:
-    """Bytes of each frame, the pictures a decoder made of them, and the processor time of both."""
+    """Bytes of each frame, the pictures a decoder made of them, the processor time of both, and the
+    coder's notes."""
 
     frame_bytes: Sequence[int]
     decoded: Sequence[I420]
     cpu_ms: float
     decoder_cpu_ms: float
+    notes: Mapping[str, Notes] = field(default_factory=dict)
 
     def measured(self, point: float, frames: Sequence[I420], **notes: Notes) -> CodedClip:
-        """Return the clip, coded at ``point``, with its errors against the camera's ``frames``."""
+        """Return the clip, coded at ``point``, with its errors against the camera's ``frames``, and
+        with ``notes`` besides."""
         pairs = list(zip(self.decoded, frames, strict=True))
         return CodedClip(
             point,
@@ -82,7 +85,7 @@ class CodedPictures:
             np.array([luma_mse(*pair) for pair in pairs]),
             np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
             self.cpu_ms,
-            notes,
+            {**self.notes, **notes},
             self.decoder_cpu_ms,
         )
 

@@ -8,7 +8,7 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfedge.evaluate.clips import Clip, CodedClip
-from rfedge.evaluate.compare.measure import SSIM_WINDOW, compare_rows, ssim_rows
+from rfedge.evaluate.compare.measure import compare_rows, quality_rows
 from rfedge.evaluate.compare.rows import BEST, BEST_OF_ANY_CPU
 from rfedge.evaluate.performance import (
     ROUNDS,
@@ -18,6 +18,7 @@ from rfedge.evaluate.performance import (
     perform,
     time_in_turns,
 )
+from rfedge.evaluate.rate_curve import LPIPS, SSIM
 from rfedge.jobs import CellStore
 
 PLANE = np.zeros((2, 2), np.uint8)
@@ -104,16 +105,31 @@ def with_ssim(each, factor):
 
 def test_by_ssim_the_figure_is_the_ratio_of_rates_too():
     ours, theirs = with_ssim(OURS, 1), with_ssim(OURS, 4)
-    (row,) = ssim_rows(CLIP, ours, {"x264-ssim": [theirs]})
+    (row,) = quality_rows(SSIM, CLIP, ours, {"x264-ssim": [theirs]})
     assert row.bd_rate_percent == pytest.approx(-75)
-    assert row.window_ssim == SSIM_WINDOW
+    assert row.window == SSIM.window
+
+
+def test_by_lpips_less_is_better():
+    """Distances that fall from point to point: the figure is the ratio of the rates again."""
+
+    def with_lpips(each, factor):
+        clips = sorted(each.clips, key=lambda clip: clip.bytes_per_frame())
+        notes = [{"lpips": (9, *[0.4 / 1.5**k] * 9)} for k in range(len(clips))]
+        pairs = zip(clips, notes, strict=True)
+        made = (replace(c, notes=n, frame_bytes=c.frame_bytes * factor) for c, n in pairs)
+        return replace(each, clips=tuple(made))
+
+    ours, theirs = with_lpips(OURS, 1), with_lpips(OURS, 4)
+    (row,) = quality_rows(LPIPS, CLIP, ours, {"x264": [theirs]})
+    assert row.bd_rate_percent == pytest.approx(-75)
 
 
 def test_by_ssim_a_curve_that_does_not_span_the_window_has_no_row():
     low = replace(
         OURS, clips=tuple(replace(c, ssim=c.ssim * 0.9) for c in with_ssim(OURS, 1).clips)
     )
-    assert ssim_rows(CLIP, low, {"x264-ssim": [with_ssim(OURS, 1)]}) == []
+    assert quality_rows(SSIM, CLIP, low, {"x264-ssim": [with_ssim(OURS, 1)]}) == []
 
 
 def test_the_first_frame_is_told_apart_from_the_steady_state(rows):

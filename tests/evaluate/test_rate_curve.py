@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from rfcore.errors import InvalidInput
 from rfedge.evaluate.clips import CodedClip
 from rfedge.evaluate.rate_curve import (
+    LPIPS,
+    SSIM,
     RateCurve,
     bd_rate_interval,
     bd_rate_percent,
     rate_curve,
-    ssim_curve,
-    ssim_db,
 )
 
 DECIBELS = np.array([28.0, 29.5, 31.0, 33.0, 35.0, 37.0])
@@ -156,8 +156,9 @@ def test_frames_that_resemble_their_neighbours_widen_the_interval():
     assert width(ratios) > 1.5 * width(shuffled)
 
 
-def test_ssim_in_decibels_counts_what_lacks_to_one():
-    assert [ssim_db(s) for s in (0.9, 0.99)] == pytest.approx([10, 20])
+def test_a_quality_in_decibels_counts_what_lacks_to_equal_pictures():
+    assert [LPIPS.db(d) for d in (0.1, 0.01)] == pytest.approx([10, 20])
+    assert [SSIM.db(s) for s in (0.9, 0.99)] == pytest.approx([10, 20])
 
 
 def test_a_curve_over_ssim_is_of_the_mean_over_frames():
@@ -166,8 +167,8 @@ def test_a_curve_over_ssim_is_of_the_mean_over_frames():
         CodedClip(k, np.array([9, 8, 8]) * (9 - k), np.ones(3), ssim - 0.01 * k, 0.0)
         for k in range(6)
     ]
-    curve = ssim_curve(points, slice(1, None))
-    assert curve.psnr_db[-1] == pytest.approx(ssim_db(0.92))
+    curve = SSIM.curve(points, slice(1, None))
+    assert curve.psnr_db[-1] == pytest.approx(SSIM.db(0.92))
     assert curve.bytes_per_frame[-1] == 72
 
 

@@ -17,8 +17,8 @@ from lab.classes import EvalClasses
 from lab.classes.measure import (
     GROUPS,
     LEVELS,
-    ClassCoder,
     ClassCurve,
+    ClassErrors,
     ClassQuality,
     quality_at,
     run_classes,
@@ -26,6 +26,7 @@ from lab.classes.measure import (
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import I420
 from rfedge.evaluate.clips import Clip, CodedClip, DriveName, luma_mse
+from rfedge.evaluate.noted_coder import NotedCoder
 from rfedge.evaluate.rivals import CodedPictures
 from rfedge.results import read_result
 from streetgen.classes import Label
@@ -69,7 +70,8 @@ def quarters(frames: int) -> list[np.ndarray]:
 @pytest.mark.parametrize("group", [REST, VEHICLE, PERSON])
 def test_an_error_in_one_class_is_counted_there_and_nowhere_else(group):
     frames, groups = [grey(100)] * 3, quarters(3)
-    coded = ClassCoder(WrongInOneGroup(groups, group, 7), groups).code(frames, 10.0, 20.0)
+    coder = NotedCoder(WrongInOneGroup(groups, group, 7), ClassErrors(groups))
+    coded = coder.code(frames, 10.0, 20.0)
     for index, name in enumerate(GROUPS):
         expected = 49.0 * (groups[0] == group).sum() if index == group else 0.0
         assert coded.notes[f"{name}_sse"] == (expected,) * 3
@@ -80,7 +82,7 @@ def test_the_classes_errors_add_up_to_the_pictures():
     frames = [grey(int(level)) for level in rng.integers(20, 200, 4)]
     groups = [rng.integers(0, len(GROUPS), (8, 8)).astype(np.uint8) for _ in frames]
     coder = WrongInOneGroup(groups, SIGN, 9)
-    coded = ClassCoder(coder, groups).code(frames, 10.0, 20.0)
+    coded = NotedCoder(coder, ClassErrors(groups)).code(frames, 10.0, 20.0)
     shown = coder.pictures(frames, 10.0, 20.0).decoded
     for i, pair in enumerate(zip(shown, frames, strict=True)):
         total = sum(float(coded.notes[f"{name}_sse"][i]) for name in GROUPS)
@@ -90,7 +92,8 @@ def test_the_classes_errors_add_up_to_the_pictures():
 def test_other_classes_make_another_cell():
     groups, others = quarters(2), [LEVELS[np.zeros((8, 8), int)]] * 2
     coder = WrongInOneGroup(groups, REST, 1)
-    assert ClassCoder(coder, groups).version != ClassCoder(coder, others).version
+    versions = [NotedCoder(coder, ClassErrors(each)).version for each in (groups, others)]
+    assert versions[0] != versions[1]
 
 
 def test_every_label_belongs_to_a_class_and_bicycles_to_people():
@@ -241,7 +244,7 @@ def test_a_drive_becomes_rows_and_is_not_coded_twice(thumbnail, drive, tmp_path,
     ours = next(row for row in at_bits if (row.method, row.class_) == ("rfedge", "all"))
     assert ours.psnr_db == pytest.approx(33.5, abs=0.05)
     assert len(said.getvalue().split("PSNR of the luma")) == 3, "at equal bits and equal quality"
-    monkeypatch.setattr(ClassCoder, "code", lambda *_: pytest.fail("a clip was coded again"))
+    monkeypatch.setattr(NotedCoder, "code", lambda *_: pytest.fail("a clip was coded again"))
     run_classes(job, Console(file=io.StringIO()))
     assert read_result(job.out)["rows"] == result["rows"]
 
@@ -249,7 +252,7 @@ def test_a_drive_becomes_rows_and_is_not_coded_twice(thumbnail, drive, tmp_path,
 def test_missing_or_unfit_class_pictures_are_named_before_anything_is_coded(
     thumbnail, drive, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(ClassCoder, "code", lambda *_: pytest.fail("a clip was coded"))
+    monkeypatch.setattr(NotedCoder, "code", lambda *_: pytest.fail("a clip was coded"))
     with pytest.raises(DatasetError, match=r"0.png: is not in a folder `images`.*streetgen build"):
         run_classes(job_of(thumbnail.field, thumbnail.drive, tmp_path), Console())
     folder = tmp_path / "copy"

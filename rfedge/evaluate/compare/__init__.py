@@ -57,6 +57,10 @@ class EvalCompare(Experiment):
     """Code what is not there yet on the Ray cluster at this address (`local` starts one here;
     docs/how-to/servers.md). Processor times are taken here afterwards, and the rows are the same.
     Needs rfedge[ray]."""
+    lpips_weights: Path | None = None
+    """Folder of LPIPS's weights (`make lpips-weights` makes `out/lpips`): LPIPS by AlexNet of every
+    decoded picture too, with a BD-rate of its own. Half a second a picture; needs
+    rfedge[reference]."""
     figures: Path | None = None
     """Folder for the curves as SVG, with their numbers as CSV."""
 
@@ -85,6 +89,8 @@ class EvalCompare(Experiment):
 
         if self.ray is not None:
             require("ray", "ray")
+        if self.lpips_weights is not None:
+            require("reference", "torch")
         console = Console()
         result = run_compare(replace(self, field=field_source(self.field)), console)
         if self.figures is not None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import cast
 
@@ -34,6 +34,7 @@ from rfedge.evaluate.clips import (
 from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.compare.foreground import ForegroundCoder, foreground_mask
 from rfedge.evaluate.field_coder import CRFS, WITHOUT_FIELD, FieldCoder, RenderedClip, render_clip
+from rfedge.evaluate.noted_coder import FrameNotes, NotedCoder, PictureCoder
 from rfedge.evaluate.rate_curve import QUICK_POINTS
 from rfedge.evaluate.rivals import (
     Rival,
@@ -174,7 +175,7 @@ class DriveComparison:
     field_bytes: int
     foregrounds: Sequence[NDArray[np.bool_]]
     background: str | None
-    methods: Sequence[FieldCoder]
+    methods: Sequence[ClipCoder]
     families: Mapping[str, Sequence[ClipCoder]]
     for_ssim: Mapping[str, Sequence[ClipCoder]]
     foreground_only: ForegroundCoder | None
@@ -237,7 +238,6 @@ def _drive_comparison(
     families = asked_families(job)
     if job.quick:
         families = {name: [*map(_at_few_points, those)] for name, those in families.items()}
-    families |= {coder.name: [coder] for coder in map(foreign_coder, job.method)}
     rendered = render_clip(field, drive.cameras)
     foregrounds = _foregrounds(drive, background)
     behind = None if background is None else background.digest
@@ -261,6 +261,14 @@ def _drive_comparison(
     if behind is not None:
         rival_stamp = f"{stamp}, field {rendered.field_id}"
         rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
+    methods: list[ClipCoder] = list(coders.values())
+    if job.lpips_weights is not None:
+        from rfedge.evaluate.lpips import Lpips
+
+        noted = partial(_noted, Lpips(job.lpips_weights))
+        methods = [*map(noted, methods)]
+        families = {name: [*map(noted, those)] for name, those in families.items()}
+    families |= {coder.name: [coder] for coder in map(foreign_coder, job.method)}
     by_ssim = {} if job.rivals or job.quick else ssim_rivals()
     field_bytes = field.size_bytes if isinstance(field, OwnField) else given.field.stat().st_size
     return DriveComparison(
@@ -270,7 +278,7 @@ def _drive_comparison(
         field_bytes,
         foregrounds,
         behind,
-        list(coders.values()),
+        methods,
         families,
         by_ssim,
         rival,
@@ -285,6 +293,10 @@ def _few(points: Sequence[float]) -> tuple[float, ...]:
 
 def _at_few_points(coder: ClipCoder) -> ClipCoder:
     return replace(coder, points=_few(coder.points)) if isinstance(coder, Rival) else coder
+
+
+def _noted(noted: FrameNotes, coder: ClipCoder) -> ClipCoder:
+    return NotedCoder(coder, noted) if isinstance(coder, PictureCoder) else coder
 
 
 def _foregrounds(drive: Drive, background: Drive | None) -> list[NDArray[np.bool_]]:

@@ -23,23 +23,21 @@ from rfedge.evaluate.compare.rows import (
     BreakEvenRow,
     CompareRow,
     CurveRow,
-    SsimRow,
+    QualityRow,
 )
 from rfedge.evaluate.performance import HEADLINE_DB, Performance
 from rfedge.evaluate.rate_curve import (
+    LPIPS,
+    Quality,
     Window,
     bd_rate_interval,
     bd_rate_percent,
-    ssim_curve,
-    ssim_db,
 )
 
 WINDOWS_DB: tuple[Window, ...] = (HEADLINE_DB, (30.0, 33.0), (30.0, 35.0), (35.0, 38.0))
 """The headline window, then others."""
 ANCHORS_AND_BEST = ("x264-lowdelay", "x264-our-tools", BEST, BEST_OF_ANY_CPU)
 """Beginnings of the names of families that are compared over the other windows, too."""
-SSIM_WINDOW: Window = (0.88, 0.92)
-"""Window of the luma's mean SSIM, about that of 33 to 35 dB on the streets at hand."""
 SAVING_AT_DB = (31.0, 33.0, 35.0)
 BOOTSTRAP_SEED = 2026
 PASSES = (1, 10, 100)
@@ -172,24 +170,27 @@ def _both_ends(performance: Performance) -> tuple[float, float, float]:
     return performance.both_ends_ms, performance.cpu.least_ms, performance.cpu.most_ms
 
 
-def ssim_rows(
-    clip: Clip, method: Performance, families: Mapping[str, Sequence[Performance]]
-) -> list[SsimRow]:
-    """Return a row per family over a window of mean SSIM; none where a curve does not span it."""
+def quality_rows(
+    quality: Quality,
+    clip: Clip,
+    method: Performance,
+    families: Mapping[str, Sequence[Performance]],
+) -> list[QualityRow]:
+    """Return a row per setting over the window of another quality; none where a curve does not
+    span it."""
     if not families:
         return []
-    low, high = SSIM_WINDOW
-    window = (ssim_db(low), ssim_db(high))
-    ours = ssim_curve(method.clips, STEADY)
-    curves = [
-        (family, rival.name, ssim_curve(rival.clips, STEADY))
+    window = quality.window_db
+    ours = quality.curve(method.clips, STEADY, method.least_points)
+    curves = {
+        (family, rival.name): quality.curve(rival.clips, STEADY, rival.least_points)
         for family, rivals in families.items()
         for rival in rivals
-    ]
+    }
     drive = (clip.scene, clip.rate_hz, method.name)
     return [
-        SsimRow(*drive, family, name, SSIM_WINDOW, bd_rate_percent(theirs, ours, window))
-        for family, name, theirs in curves
+        QualityRow(*drive, *rival, quality.window, bd_rate_percent(theirs, ours, window))
+        for rival, theirs in curves.items()
         if ours.spans(window) and theirs.spans(window)
     ]
 
@@ -227,6 +228,9 @@ def _curve(clip: Clip, family: str, who: Performance) -> CurveRow:
         psnr_db=[at.psnr_db() for at in coded],
         bytes_per_frame=[at.bytes_per_frame() for at in coded],
         ssim=[float(at.ssim[STEADY].mean()) for at in coded],
+        lpips=[float(at.values(LPIPS.name)[STEADY].mean()) for at in coded]
+        if all(LPIPS.name in at.notes for at in coded)
+        else None,
     )
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeVar
 
+from rfedge.evaluate.rate_curve import LPIPS, SSIM
 from rfedge.report.tables import Column, Table, columns, shown
 from rfedge.results import Result, rows_of
 
@@ -68,7 +69,7 @@ AT_QUALITIES = Column(
         for db in SAVING_AT_DB
     ),
 )
-SSIM = Column("SSIM", lambda row: (row.ssim, row.rival_ssim), "{:.3f} / {:.3f}")
+BOTH_SSIM = Column("SSIM", lambda row: (row.ssim, row.rival_ssim), "{:.3f} / {:.3f}")
 FIRST_FRAME = Column(
     "first frame kB",
     lambda row: (row.first_frame_bytes / 1e3, row.rival_first_frame_bytes / 1e3),
@@ -88,15 +89,15 @@ BOTH_ENDS = Column(
 
 
 @dataclass(frozen=True)
-class SsimRow:
-    """One method against one rival that is tuned for SSIM, over a window of mean SSIM."""
+class QualityRow:
+    """One method against one rival over the window of another ``Quality`` than the PSNR."""
 
     scene: str
     hz: float
     method: str
     rival: str
     rival_setting: str = field(metadata=shown("rival"))
-    window_ssim: Sequence[float] = field(metadata=shown("window of SSIM", "{:g}..{:g}"))
+    window: Sequence[float] = field(metadata=shown("window", "{:g}..{:g}"))
     bd_rate_percent: float = field(metadata=shown("BD-rate %", "+.1f"))
 
 
@@ -164,9 +165,12 @@ class CurveRow:
     psnr_db: Sequence[float]
     bytes_per_frame: Sequence[float]
     ssim: Sequence[float]
+    lpips: Sequence[float] | None = None
 
 
-Row = TypeVar("Row", bound=CompareRow | SsimRow | BreakEvenRow | BitShareRow)
+BY_QUALITY = {SSIM: "By SSIM, against rivals tuned for it", LPIPS: f"By {LPIPS.title}"}
+"""Headings of the qualities beside the PSNR whose rows a result may have, by their names."""
+Row = TypeVar("Row", bound=CompareRow | QualityRow | BreakEvenRow | BitShareRow)
 
 
 def compare_parts(result: Result) -> Iterator[Table | str]:
@@ -181,9 +185,10 @@ def compare_parts(result: Result) -> Iterator[Table | str]:
     break_even = of_first_method(rows_of(BreakEvenRow, result.get("break_even", ())))
     if break_even:
         yield Table("What the field's own bytes leave of the saving", _BREAK_EVEN, break_even)
-    by_ssim = rows_of(SsimRow, result.get("ssim", ()))
-    if by_ssim:
-        yield Table("By SSIM, against rivals tuned for it", [DRIVE, *columns(SsimRow)], by_ssim)
+    for quality, heading in BY_QUALITY.items():
+        by_quality = rows_of(QualityRow, result.get(quality.name, ()))
+        if by_quality:
+            yield Table(heading, [DRIVE, *columns(QualityRow)], by_quality)
     bits = rows_of(BitShareRow, result.get("bits", ()))
     if bits:
         yield Table("Where the bits go, near 33.5 dB", [DRIVE, *columns(BitShareRow)], bits)
@@ -230,7 +235,7 @@ def _compared_tables(compared: Sequence[CompareRow]) -> Iterator[Table | str]:
     told = ("bd_rate_percent", "ci95")
     for name, rows in _by_drive(of_first_method(first)).items():
         rival = Column("rival", partial(_starred, rows))
-        against = columns(CompareRow, rival, *told, BOTH_ENDS, AT_QUALITIES, SSIM, FIRST_FRAME)
+        against = columns(CompareRow, rival, *told, BOTH_ENDS, AT_QUALITIES, BOTH_SSIM, FIRST_FRAME)
         once = {row.rival_setting: row for row in rows}
         yield Table(f"{name}: {ours} over {window} dB. {STARS}", against, list(once.values()))
     family = _anchor(compared)

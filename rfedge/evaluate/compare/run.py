@@ -36,7 +36,7 @@ from rfedge.evaluate.compare.measure import (
     break_even_row,
     compare_rows,
     curve_rows,
-    ssim_rows,
+    quality_rows,
 )
 from rfedge.evaluate.compare.rows import BitShareRow, compare_parts
 from rfedge.evaluate.performance import (
@@ -48,7 +48,7 @@ from rfedge.evaluate.performance import (
     spanning_points,
     time_in_turns,
 )
-from rfedge.evaluate.rate_curve import QUICK_POINTS, Window
+from rfedge.evaluate.rate_curve import LPIPS, QUICK_POINTS, SSIM, Window
 from rfedge.evaluate.runner import Run, clip_key, coded_clip
 from rfedge.jobs import CellStore, Job, Tell
 from rfedge.results import rows_of
@@ -247,7 +247,8 @@ def _tables(job: EvalCompare, comparison: DriveComparison, run: Run) -> dict[str
                 interval=not job.quick,
             )
         ],
-        "ssim": ssim_rows(clip, methods[0], for_ssim),
+        SSIM.name: quality_rows(SSIM, clip, methods[0], for_ssim),
+        LPIPS.name: quality_rows(LPIPS, clip, methods[0], families) if job.lpips_weights else [],
         "break_even": [break_even_row(clip, m, anchor, field_bytes) for m in methods],
         "bits": [] if job.quick else _bits(job, comparison, methods[0], run),
         "foreground": foreground,
