@@ -89,7 +89,7 @@ FILES: Mapping[str, str] = {
 }
 ROWS: Mapping[str, str] = {
     "compare rows": "rfedge.evaluate.compare.rows:CompareRow",
-    "compare ssim": "rfedge.evaluate.compare.rows:SsimRow",
+    "compare ssim": "rfedge.evaluate.compare.rows:QualityRow",
     "compare break_even": "rfedge.evaluate.compare.rows:BreakEvenRow",
     "compare bits": "rfedge.evaluate.compare.rows:BitShareRow",
     "compare foreground": "rfedge.evaluate.compare.rows:ForegroundRow",
