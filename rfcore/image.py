@@ -165,7 +165,7 @@ def read_pixels(path: Path, *, is_p3: bool = False) -> Pixels:
 def rgb_from_bytes(data: bytes, source: str) -> Rgb:
     """Return a picture file's content as uint8 [H, W, 3]; raise ``DatasetError`` naming ``source``
     if it cannot be decoded."""
-    return pixels_of(_frame(BytesIO(data), source), source).rgb
+    return pixels_of(frame_from_bytes(data, source), source).rgb
 
 
 def read_frame(path: Path) -> av.VideoFrame:
@@ -173,15 +173,20 @@ def read_frame(path: Path) -> av.VideoFrame:
     try:
         if path.stat().st_size > MAX_PICTURE_BYTES:
             raise DatasetError(f"{path}: is above {MAX_PICTURE_BYTES} bytes; save the picture anew")
-        return _frame(BytesIO(path.read_bytes()), str(path))
+        return frame_from_bytes(path.read_bytes(), str(path))
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _frame(file: BytesIO, source: str) -> av.VideoFrame:
-    """Decode a picture by its content: a name may be a pattern, and a playlist names others."""
+def frame_from_bytes(data: bytes, source: str) -> av.VideoFrame:
+    """Decode a picture by its content: a name may be a pattern, and a playlist names others.
+
+    Raises as ``rgb_from_bytes``.
+    """
     try:
-        with av.open(file, "r", options={"format_whitelist": PICTURE_FORMATS}) as container:
+        with av.open(
+            BytesIO(data), "r", options={"format_whitelist": PICTURE_FORMATS}
+        ) as container:
             _check_pixels(source, container.streams.video[0])
             return next(container.decode(video=0))
     except (FFmpegError, OSError, StopIteration, IndexError) as error:

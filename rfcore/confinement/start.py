@@ -34,6 +34,9 @@ of one the program becomes nobody (``confine``) and loses these two capabilities
 user namespaces is refused by the filter."""
 
 Descriptors = Sequence[int]
+BEST_FIRST = (Confinement.BUBBLEWRAP, Confinement.LANDLOCK)
+READY = b"."
+"""The first byte that a reader writes: it is confined."""
 
 
 def check_not_root(as_root: bool) -> None:
@@ -121,3 +124,35 @@ class ConfinedProgram:
             stdout=stdout,
             stderr=stderr,
         )
+
+
+def confined_reader(
+    module: str,
+    arguments: Sequence[str],
+    descriptors: Descriptors,
+    best_first: Sequence[Confinement] = BEST_FIRST,
+) -> tuple[subprocess.Popen[bytes], Confinement]:
+    """Start a module that reads open files and answers on its standard output, after ``READY``.
+
+    The first of ``best_first`` that works here is used, and returned. Raises
+    ``BackendUnavailable``, which says why each did not.
+    """
+    problems = []
+    for confinement in best_first:
+        environment = {"OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+        if "PYTHONPATH" in os.environ:
+            environment["PYTHONPATH"] = os.environ["PYTHONPATH"]
+        program = ConfinedProgram(module, confinement, environment)
+        try:
+            process = program.start(arguments, descriptors, subprocess.PIPE, subprocess.PIPE)
+        except BackendUnavailable as error:
+            problems.append(str(error))
+            continue
+        assert process.stdout is not None
+        assert process.stderr is not None
+        if process.stdout.read(1) == READY:
+            process.stderr.close()
+            return process, confinement
+        _, errors = process.communicate()
+        problems.append((errors.decode(errors="replace").splitlines() or ["ended"])[-1][:200])
+    raise BackendUnavailable("; ".join(problems))

@@ -2,8 +2,9 @@
 
 ``transforms.json`` (nerfstudio, instant-ngp), a COLMAP model, a KITTI odometry sequence or raw
 drive, INRIA's ``cameras.json``, ``camera.toml`` for a recording of one's own, or what servers
-recorded: one ``recording.jsonl``, or a folder that they lie below, together in order of time. A
-folder with more than one of the others is ambiguous: the file itself is to be named.
+recorded: one ``recording.jsonl``, or a folder that they lie below, together in order of time; or an
+MCAP file or ROS 2 bag. A folder with more than one of the others is ambiguous: the file itself is
+to be named.
 
 ``read_inria_source`` reads the ``cameras.json`` of the INRIA 3D Gaussian Splatting code: each entry
 has ``img_name``, ``width``, ``height``, ``fx``, ``fy`` in pixels, ``position`` in the
@@ -40,6 +41,7 @@ import numpy as np
 
 from rfcore.camera import Intrinsics, Pose, TileOrigin
 from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions, assemble
+from rfcore.dataset.bag_file import is_bag
 from rfcore.dataset.colmap import colmap_models, images_file, read_colmap_source
 from rfcore.dataset.keys import (
     POSE_SHAPES,
@@ -267,7 +269,7 @@ def _inria_camera(where: str, keys: Table) -> SourceCamera:
 
 EXPECTED = (
     "transforms.json, sparse/0 of COLMAP, calib.txt or oxts of KITTI, cameras.json of INRIA, "
-    "camera.toml, recording.jsonl of a server"
+    "camera.toml, recording.jsonl of a server, an MCAP file or ROS 2 bag"
 )
 
 
@@ -296,8 +298,10 @@ def read_dataset(
     return assemble(read_source(path), options)
 
 
-def read_source(path: Path) -> Source:
-    """Read what is there, with its lenses and its own world."""
+def read_source(path: Path, topics: tuple[str, ...] = ()) -> Source:
+    """Read what is there, with its lenses and its own world; of a bag, what ``topics`` name."""
+    if topics:
+        return _read_bag(path, topics)
     if path.is_dir():
         return read_kitti_raw_source(path.parent) if path.name == OXTS else _read_folder(path)
     if not path.exists():
@@ -308,12 +312,20 @@ def read_source(path: Path) -> Source:
         return read_recorded_source(path)
     if path.name == "calib.txt":
         return read_kitti_source(path.parent)
+    if is_bag(path):
+        return _read_bag(path)
     if path.suffix in (".bin", ".txt"):
         return read_colmap_source(path.parent)
     if path.suffix != ".json":
         refuse_video(path)
         raise DatasetError(f"{path}: is no file that describes a dataset ({EXPECTED})")
     return read_inria_source(path) if path.name == "cameras.json" else read_transforms_source(path)
+
+
+def _read_bag(path: Path, topics: tuple[str, ...] = ()) -> Source:
+    from rfcore.dataset.bag import BagChoice, read_bag_source
+
+    return read_bag_source(path, BagChoice(topics))
 
 
 def refuse_video(path: Path) -> None:
@@ -332,6 +344,8 @@ def _read_folder(folder: Path) -> Source:
     recorded = [] if found else recordings_under(folder)
     if recorded:
         return read_recorded_source(*recorded)
+    if not found and is_bag(folder):
+        return _read_bag(folder)
     if not found:
         _refuse_pictures_alone(folder)
         raise DatasetError(f"{folder}: no dataset is recognised there (none of {EXPECTED})")

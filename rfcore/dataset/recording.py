@@ -15,6 +15,8 @@
     [pictures]
     video = "drive.mp4"             # or folder = "frames", in the order of the names, with
     rate_hz = 10.0                  #   rate_hz, or times = "times.txt", a time in seconds a line
+                                    # or bag = "drive.mcap", an MCAP file or ROS 2 bag, with
+                                    #   topics = ["/front/image", "/odom"] if it has several
     every = 1                       # take each n-th picture
 
     [trajectory]
@@ -26,6 +28,9 @@
 
     [points]                        # may be left out
     file = "lidar.ply"              # coloured surface points in the trajectory's world
+
+With a bag, [camera] and [trajectory] may be left out: they are the bag's (``rfcore.dataset.bag``).
+A [trajectory] without a file is the bag's poses, of a body; ``body_from_cam`` is the camera on it.
 
 The camera has OpenCV axes. A video's time starts at 0 with its first frame, a folder's with the
 first picture (``rate_hz``) or where ``times`` says.
@@ -64,7 +69,7 @@ from rfcore.views import Mask
 
 SECTIONS = {
     "camera": "model width_px height_px fx_px fy_px cx_px cy_px k1 k2 k3 k4 p1 p2",
-    "pictures": "video folder rate_hz times every",
+    "pictures": "video folder rate_hz times every bag topics",
     "trajectory": "file time_offset_s max_gap_s outside body_from_cam",
     "points": "file",
     "anchor": "latitude_deg longitude_deg height_m enu_from_world point_m",
@@ -149,7 +154,12 @@ class TimedPictures:
 
 def read_recording_source(file: Path) -> Source:
     """Read a ``camera.toml`` and what it names. Raises ``DatasetError`` naming the file and key."""
-    content = _load(file)
+    content = _load(file, required=("pictures",))
+    if "bag" in content["pictures"]:
+        return _bag_source(file, content)
+    for section in REQUIRED:
+        if section not in content:
+            raise DatasetError(f"{file}: section [{section}] is missing")
     where = f"{file}: [camera]"
     camera = _camera(where, content["camera"])
     timed = _timed_pictures(file, content["pictures"], camera)
@@ -171,6 +181,30 @@ def read_recording_source(file: Path) -> Source:
     dropped = len(timed.pictures) - len(pictures)
     anchor = anchor_at(str(file), content["anchor"].values if "anchor" in content else None)
     return Source(file, pictures, _points(file, content), dropped, anchor=anchor, notes=timed.notes)
+
+
+def _bag_source(file: Path, content: Mapping[str, Table]) -> Source:
+    from rfcore.dataset.bag import BagChoice, read_bag_source
+
+    keys, where = content["pictures"], f"{file}: [pictures]"
+    if other := [key for key in ("video", "folder", "rate_hz", "times") if key in keys]:
+        raise DatasetError(f"{where}: a bag and '{other[0]}' exclude each other")
+    topics = keys.items("topics") if "topics" in keys else []
+    if not all(isinstance(topic, str) for topic in topics):
+        raise keys.error("topics", f"is {topics}, not names of topics")
+    camera = _camera(f"{file}: [camera]", content["camera"]) if "camera" in content else None
+    poses, body_from_cam = None, None
+    if "trajectory" in content and "file" in content["trajectory"]:
+        poses = RecordedPoses.of(file, content["trajectory"])
+    elif "trajectory" in content:
+        content["trajectory"].require_known(["body_from_cam"])
+        rows = content["trajectory"].matrix("body_from_cam", POSE_SHAPES)
+        body_from_cam = pose_of_rows(f"{file}: [trajectory]", "body_from_cam", rows)
+    choice = BagChoice(tuple(topics), camera, body_from_cam)
+    found = read_bag_source(inside(where, file.parent, keys.text("bag")), choice, poses)
+    anchor = anchor_at(str(file), content["anchor"].values if "anchor" in content else None)
+    pictures = found.pictures[:: keys.whole("every", Range(1), 1)]
+    return replace(found, pictures=pictures, points=_points(file, content), anchor=anchor)
 
 
 def read_recording_camera(file: Path) -> RecordingCamera:
@@ -219,7 +253,7 @@ def _camera(where: str, keys: Table) -> SourceCamera:
 def _timed_pictures(file: Path, keys: Table, camera: SourceCamera) -> TimedPictures:
     where = f"{file}: [pictures]"
     if ("video" in keys) == ("folder" in keys):
-        raise DatasetError(f"{where}: name either a 'video' or a 'folder'")
+        raise DatasetError(f"{where}: name a 'video', a 'folder' or a 'bag'")
     every = keys.whole("every", Range(1), 1)
     timed = _video_pictures if "video" in keys else _folder_pictures
     found = timed(where, file.parent, keys, camera)

@@ -6,8 +6,8 @@ the lens they were taken with. ``rfcore.dataset.assemble`` makes a ``Dataset`` o
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +78,7 @@ class Source:
     deleted on purpose, by the rules of the format. ``exposure_varies`` is true where the dataset
     says that the camera chose exposure or white balance anew for each picture. ``anchor`` says
     where on the Earth its world is, if the dataset does. ``notes`` says in a line each what the
-    reader chose or left out.
+    reader chose or left out. ``feeds`` has lines of pose feeds by the topic they were recorded on.
     """
 
     file: Path
@@ -88,6 +88,7 @@ class Source:
     exposure_varies: bool = False
     anchor: Anchor | None = None
     notes: tuple[str, ...] = ()
+    feeds: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 COLOURS = [

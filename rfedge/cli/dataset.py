@@ -32,7 +32,7 @@ class DatasetConvert:
 
     dataset: Annotated[Path, Positional, DATASET]
     """A folder with transforms.json, a COLMAP model, a KITTI sequence, INRIA's cameras.json or a
-    recording's camera.toml; or that file itself."""
+    recording's camera.toml; or that file itself; or an MCAP file or ROS 2 bag."""
     out: Annotated[Path, FOLDER]
     """The folder to make."""
     size: Annotated[str | None, SIZE] = None
@@ -41,6 +41,8 @@ class DatasetConvert:
     """Take each n-th picture."""
     offset: int = 0
     """Number of first pictures to leave out."""
+    topics: Annotated[tuple[str, ...], arg(metavar="TOPIC ...")] = ()
+    """Of a bag with several cameras or poses, the topics of those that are meant."""
 
     def run(self) -> None:
         """Convert; the folder appears when all of it is there."""
@@ -48,7 +50,7 @@ class DatasetConvert:
 
         size_px = parse_size(self.size) if self.size is not None else None
         chosen = slice(self.offset, None, self.every)
-        print(convert_dataset(self.dataset, self.out, size_px, chosen))
+        print(convert_dataset(self.dataset, self.out, size_px, chosen, self.topics))
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,11 @@ class Doctor:
     """
 
     path: Annotated[Path, Positional, arg(metavar="FILE|FOLDER")]
-    """Splats of any program, a field, a dataset, pictures, a video."""
+    """Splats of any program, a field, a dataset, an MCAP file or ROS 2 bag, pictures, a video."""
 
     def run(self) -> None:
         """Print a line for each thing."""
+        from rfcore.dataset.bag_file import is_bag
         from rfcore.errors import DatasetError, InvalidInput
         from rfcore.field.splat_file import looks_like_splats
 
@@ -39,6 +40,8 @@ class Doctor:
                 lines = _of_field(self.path)
             elif looks_like_splats(self.path):
                 lines = _of_splats(self.path)
+            elif is_bag(self.path):
+                lines = _of_bag(self.path)
             else:
                 lines = _of_dataset(self.path)
             for line in lines:
@@ -82,6 +85,35 @@ def _of_splats(path: Path) -> Iterator[str]:
     yield from read.notes
     name = shlex.quote(path.stem.partition(".")[0] or "field")
     yield f"next: rfedge field import {shlex.quote(str(path))} --name {name}"
+
+
+def _of_bag(path: Path) -> Iterator[str]:
+    """Yield a line a topic, then what a dataset of it would be; what hinders one is no error."""
+    from rfcore.dataset.bag import BagChoice, BagIndex, read_bag_source
+    from rfcore.errors import DatasetError
+
+    index = BagIndex.of(path)
+    yield f"{path}: a bag of {sum(topic.count for topic in index.topics)} messages"
+    for topic in sorted(index.topics, key=lambda topic: topic.name):
+        refused = f"  ({topic.refused})" if topic.refused else ""
+        rate = f"{topic.rate_hz:.3g} a second" if topic.rate_hz else ""
+        yield f"  {topic.name}  {topic.type}  {topic.count}  {rate}{refused}"
+    for feed in (*index.fixes, *index.poses):
+        yield f"{feed}: a pose feed, which `rfedge dataset convert` writes beside the pictures"
+    quoted = shlex.quote(str(path))
+    cameras = list(index.pictures) if len(index.pictures) > 1 else [None]
+    for camera in cameras:
+        chosen = [] if camera is None else [camera]
+        try:
+            source = read_bag_source(path, BagChoice(tuple(chosen)))
+        except DatasetError as error:
+            yield f"no dataset yet: {error}"
+            continue
+        yield from _cameras(source)
+        yield from source.notes
+        source.pictures[0].read()
+        topics = f" --topics {shlex.quote(camera)}" if camera is not None else ""
+        yield f"next: rfedge dataset convert {quoted}{topics} --out DATASET"
 
 
 def _of_dataset(path: Path) -> Iterator[str]:

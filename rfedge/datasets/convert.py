@@ -20,7 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import TileOrigin
-from rfcore.dataset import Dataset, read_dataset
+from rfcore.dataset import Dataset, Distortion, ReadOptions, read_dataset
+from rfcore.dataset.assemble import assemble
+from rfcore.dataset.bag_file import is_bag
+from rfcore.dataset.read import read_source
 from rfcore.dataset.source import SourceCamera, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError, InvalidInput
@@ -30,23 +33,39 @@ from rfcore.views import PosedPicture
 
 
 def convert_dataset(
-    path: Path, out: Path, size_px: tuple[int, int] | None, chosen: slice = slice(None)
+    path: Path,
+    out: Path,
+    size_px: tuple[int, int] | None,
+    chosen: slice = slice(None),
+    topics: tuple[str, ...] = (),
 ) -> str:
     """Write ``out``; return a line about it, and one for each thing done to the pictures.
 
     Pictures are undistorted and reduced once; poses and points keep the dataset's own world.
+    ``topics`` are those of a bag that are meant; its pose feeds are written, too.
     Raises ``InvalidInput`` when ``out`` exists, ``DatasetError`` naming what is wrong in ``path``.
     """
     start, step = (1 if n is None else n for n in (chosen.start, chosen.step))
     if step < 1 or start < 0:
         raise InvalidInput("every", "must be at least 1, and the offset at least 0")
-    dataset = read_dataset(path, distortion="undistort", size_px=size_px)
+    if not is_bag(path) and topics:
+        raise InvalidInput("topics", f"belong to a bag, which {path} is not")
+    options = ReadOptions(distortion=Distortion.UNDISTORT, size_px=size_px)
+    source = read_source(path, topics)
+    dataset = assemble(source, options)
     count, dataset = len(dataset.pictures), replace(dataset, pictures=dataset.pictures[chosen])
     if not dataset.pictures:
         raise InvalidInput("offset", f"leaves none of the {count} pictures")
     with whole_folder(out) as folder:
         write_in_own_world(folder, dataset, enumerate(dataset.pictures), global_points(dataset))
-    return "\n".join([f"{out}: {len(dataset.pictures)} pictures", *dataset.changes])
+        feeds = [_write_feed(folder, *feed) for feed in source.feeds.items()]
+    return "\n".join([f"{out}: {len(dataset.pictures)} pictures", *dataset.changes, *feeds])
+
+
+def _write_feed(folder: Path, topic: str, lines: Sequence[str]) -> str:
+    name = topic.strip("/").replace("/", "_") + ".jsonl"
+    write_whole(folder / name, "".join(f"{line}\n" for line in lines))
+    return f"{name} there: {len(lines)} poses of {topic}, for cav-agent --pose-feed file:{name}"
 
 
 def write_in_own_world(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import TileOrigin
 from rfcore.confinement.confine import Confinement, ProcessLimits, confine
-from rfcore.confinement.start import ConfinedProgram
+from rfcore.confinement.start import BEST_FIRST, READY, confined_reader
 from rfcore.errors import BackendUnavailable, FieldFormatError, RfedgeError
 from rfcore.field.ply_table import printable
 from rfcore.field.splat_archive import check_decoded_size
@@ -38,10 +38,9 @@ from rfcore.field.spz import load_zstandard, needs_zstandard
 from rfcore.field.stored_splats import ImportedSplats
 from rfcore.raster.gaussians import Gaussians
 
-BEST_FIRST = (Confinement.BUBBLEWRAP, Confinement.LANDLOCK)
 READER_BYTES = 1 << 30
 """Address space of the reader, beside twice what the splats take."""
-READY, WRONG = b".", b"!"
+WRONG = b"!"
 MAX_LINE_BYTES = 4096
 NUMBERS_AT_ONCE = 1 << 20
 
@@ -108,28 +107,13 @@ def _started(
 ) -> tuple[subprocess.Popen[bytes], Confinement]:
     offset = "" if origin is None else f"{origin.east_m!r} {origin.north_m!r} {origin.up_m!r}"
     words = [str(file.fileno()), str(max_bytes), str(path), *offset.split()]
-    problems = []
-    for confinement in best_first:
-        environment = {"OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-        if "PYTHONPATH" in os.environ:
-            environment["PYTHONPATH"] = os.environ["PYTHONPATH"]
-        program = ConfinedProgram("rfedge.fields.confined_reader", confinement, environment)
-        try:
-            process = program.start(words, [file.fileno()], subprocess.PIPE, subprocess.PIPE)
-        except BackendUnavailable as error:
-            problems.append(str(error))
-            continue
-        assert process.stdout is not None
-        assert process.stderr is not None
-        if process.stdout.read(1) == READY:
-            process.stderr.close()
-            return process, confinement
-        _, errors = process.communicate()
-        problems.append((errors.decode(errors="replace").splitlines() or ["ended"])[-1][:200])
-    raise BackendUnavailable(
-        f"no sandbox for the reader of {path.name} works here: {'; '.join(problems)}. If you trust "
-        "the file, give --unconfined"
-    )
+    try:
+        return confined_reader("rfedge.fields.confined_reader", words, [file.fileno()], best_first)
+    except BackendUnavailable as error:
+        raise BackendUnavailable(
+            f"no sandbox for the reader of {path.name} works here: {error}. If you trust "
+            "the file, give --unconfined"
+        ) from error
 
 
 def _received(

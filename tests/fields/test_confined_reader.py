@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from rfcore.camera import TileOrigin
+from rfcore.confinement import start
 from rfcore.confinement.confine import Confinement
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import BackendUnavailable, FieldFormatError
 from rfcore.field import read_splat_file, write_ply
 from rfcore.field.spz import encode_spz
 from rfcore.raster.gaussians import Gaussians
-from rfedge.fields import confined_reader
 from rfedge.fields.confined_reader import read_confined
 from tests.field.some import as_text, compressed_ply
 
@@ -77,7 +77,7 @@ def test_a_reader_that_a_signal_kills_is_said_to_be(ply, monkeypatch):
             command = [sys.executable, "-c", text]
             return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
-    monkeypatch.setattr(confined_reader, "ConfinedProgram", Killed)
+    monkeypatch.setattr(start, "ConfinedProgram", Killed)
     with pytest.raises(FieldFormatError, match=r"a\.ply: its reader was killed by signal SIGSYS"):
         read_confined(ply, None, MAX_BYTES, (Confinement.LANDLOCK,))
 
