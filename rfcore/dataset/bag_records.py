@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import av
 import numpy as np
@@ -166,7 +166,7 @@ class PictureDecoder:
             yield head, frame_from_bytes(data, where)
         elif self._video is not None or head["key"]:
             self._heads[self._count] = head
-            packet: av.Packet[av.VideoStream] = av.Packet(data)
+            packet = av.Packet(data)
             packet.pts = packet.dts = self._count
             self._count += 1
             yield from self._decoded(where, packet)
@@ -177,7 +177,7 @@ class PictureDecoder:
             yield from self._decoded(self._where, None)
 
     def _decoded(
-        self, where: str, packet: av.Packet[av.VideoStream] | None
+        self, where: str, packet: av.Packet[Any] | None
     ) -> Iterator[tuple[Head, av.VideoFrame]]:
         if self._video is None:
             context = av.CodecContext.create("h264", "r")
