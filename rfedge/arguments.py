@@ -44,7 +44,7 @@ FOLDER = arg(metavar="FOLDER")
 RENDERER = arg(metavar="cpu|opencl[:DEVICE]")
 RFF = arg(metavar="FILE.rff")
 PLY = arg(metavar="FILE.ply")
-SPLATS = arg(metavar="FILE.ply|.spz")
+SPLATS = arg(metavar="FILE.ply|.spz|.glb")
 JSON = arg(metavar="FILE.json")
 Up = Literal["z", "y", "-y"]
 """An axis that points up (``rfedge.fields.viewpoints.UPS``)."""

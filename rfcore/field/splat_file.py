@@ -1,7 +1,7 @@
-"""Splat files of other programs, told by their content: ``.ply`` and ``.spz`` are read.
+"""Splat files of other programs, told by their content: ``.ply``, ``.spz`` and glTF are read.
 
-What is not read is named with the command that converts it; PlayCanvas's splat-transform reads all
-but glTF, and tells formats by their suffixes.
+What is not read is named with the command that converts it, of PlayCanvas's splat-transform, which
+tells formats by their suffixes. So are a ``.gltf`` and other JSON here.
 """
 
 from __future__ import annotations
@@ -13,18 +13,20 @@ from typing import BinaryIO
 
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError
+from rfcore.field.gltf import MAGIC as GLTF_MAGIC
+from rfcore.field.gltf import read_open_gltf
 from rfcore.field.splat_ply import read_open_ply
 from rfcore.field.spz import GZIP_MAGIC, MAGIC, read_open_spz
 from rfcore.field.stored_splats import ImportedSplats, settled
 from rfcore.files import DECODED_BYTES
 
-SPLAT_SUFFIXES = (".ply", ".spz")
+SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".gltf")
 START_BYTES = 64
 """Bytes of a file that tell its format."""
 CONVERTED = (".splat", ".ksplat", ".sog", ".lcc", ".lcc2", "meta.json")
 """Ends of the names of files that splat-transform reads."""
 SOG_PICTURES = (b".webp", b"meta.json")
-ZIP_MAGIC, ZIP_NAME_AT, GLTF_MAGIC = b"PK\x03\x04", 30, b"glTF"
+ZIP_MAGIC, ZIP_NAME_AT = b"PK\x03\x04", 30
 
 
 class SplatFormat(StrEnum):
@@ -32,6 +34,14 @@ class SplatFormat(StrEnum):
 
     PLY = "ply"
     SPZ = "spz"
+    GLTF = "gltf"
+
+
+READERS = {
+    SplatFormat.PLY: read_open_ply,
+    SplatFormat.SPZ: read_open_spz,
+    SplatFormat.GLTF: read_open_gltf,
+}
 
 
 def splat_format(path: Path, start: bytes) -> SplatFormat:
@@ -43,7 +53,14 @@ def splat_format(path: Path, start: bytes) -> SplatFormat:
         return SplatFormat.PLY
     if start.startswith((GZIP_MAGIC, MAGIC.to_bytes(4, "little"))):
         return SplatFormat.SPZ
+    if start.startswith(GLTF_MAGIC) or (is_json(start) and path.suffix.lower() == ".gltf"):
+        return SplatFormat.GLTF
     raise FieldFormatError(f"{path}: {_what_else(path, start)}")
+
+
+def is_json(start: bytes) -> bool:
+    """Tell whether a file that begins so may be a JSON object."""
+    return start.lstrip().startswith(b"{")
 
 
 def looks_like_splats(path: Path) -> bool:
@@ -53,7 +70,7 @@ def looks_like_splats(path: Path) -> bool:
     with path.open("rb") as file:
         start = file.read(START_BYTES)
     read = (b"ply", GZIP_MAGIC, MAGIC.to_bytes(4, "little"), ZIP_MAGIC, GLTF_MAGIC)
-    named = (*SPLAT_SUFFIXES, *CONVERTED, ".sogs", ".glb", ".gltf")
+    named = (*SPLAT_SUFFIXES, *CONVERTED, ".sogs")
     return start.startswith(read) or path.name.lower().endswith(named)
 
 
@@ -65,13 +82,11 @@ def _what_else(path: Path, start: bytes) -> str:
             return _converted("a .sog of PlayCanvas", path, "" if suffix == ".sog" else ".sog")
         words = " ".join(shlex.quote(str(name)) for name in (path, path.with_suffix("")))
         return f"is a zip archive; unpack it and import what it holds: python -m zipfile -e {words}"
-    if start.startswith(GLTF_MAGIC) or suffix in (".glb", ".gltf"):
-        return "is glTF, which is not read; export the splats as .ply or .spz"
     ending = next((end for end in CONVERTED if path.name.lower().endswith(end)), None)
     if ending is not None:
         return _converted(f"of format {ending}", path)
     begins = f"begins with {start[:8]!r}" if start else "is empty"
-    return f"is neither a .ply nor a .spz by its content: it {begins}"
+    return f"is no .ply, .spz or .glb by its content: it {begins}"
 
 
 def _converted(what: str, path: Path, wanted_suffix: str = "") -> str:
@@ -105,5 +120,4 @@ def read_open_splat_file(
     """Read an open file named ``path`` as ``read_splat_file`` does."""
     form = splat_format(path, file.read(START_BYTES))
     file.seek(0)
-    read = read_open_ply if form is SplatFormat.PLY else read_open_spz
-    return settled(path, read(path, file, max_bytes), tile_origin)
+    return settled(path, READERS[form](path, file, max_bytes), tile_origin)

@@ -103,6 +103,7 @@ def _read_inria(path: Path, file: BinaryIO, header: Header, max_bytes: int) -> S
         antialiased=antialiased_of(path, header.comments),
         step_m=_step_m(vertex, means_m),
         notes=("colours are red, green, blue, the same from all sides",) if plain else (),
+        up=None,
     )
 
 
@@ -221,6 +222,7 @@ def _read_compressed(path: Path, file: BinaryIO, header: Header, max_bytes: int)
         antialiased=antialiased_of(path, header.comments),
         step_m=0.0,
         notes=(),
+        up=None,
     )
 
 

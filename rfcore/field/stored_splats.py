@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import TileOrigin
+from rfcore.camera import TileOrigin, Vec3
 from rfcore.errors import FieldFormatError
 from rfcore.raster.gaussians import F32, Gaussians
 
@@ -41,7 +41,8 @@ class StoredSplats:
 
     ``means_m`` [N, 3] is in the file's own world; the other arrays are as in ``Gaussians``.
     ``antialiased`` is None where the file does not say how splats are drawn. ``step_m`` is the step
-    in which positions are stored near their median, ``notes`` say what the reader did.
+    in which positions are stored near their median, ``notes`` say what the reader did. ``up`` is
+    None where the file does not say it.
     """
 
     means_m: F64
@@ -52,6 +53,7 @@ class StoredSplats:
     antialiased: bool | None = None
     step_m: float = 0.0
     notes: tuple[str, ...] = ()
+    up: Vec3 | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class ImportedSplats:
     antialiased: bool | None
     tile_origin: TileOrigin
     notes: tuple[str, ...] = ()
+    up: Vec3 | None = None
 
 
 def settled(path: Path, stored: StoredSplats, tile_origin: TileOrigin | None) -> ImportedSplats:
@@ -90,7 +93,7 @@ def settled(path: Path, stored: StoredSplats, tile_origin: TileOrigin | None) ->
     if not kept.all():
         arrays = {name: array[kept] for name, array in arrays.items()}
     splats = Gaussians(**{name: np.ascontiguousarray(array) for name, array in arrays.items()})
-    return ImportedSplats(splats, stored.antialiased, origin, tuple(notes))
+    return ImportedSplats(splats, stored.antialiased, origin, tuple(notes), stored.up)
 
 
 def sh_degree_of(coefficients: int) -> int | None:

@@ -27,17 +27,20 @@ from rfedge.cli.field_update import FieldDisagree, FieldUpdate
 
 if TYPE_CHECKING:
     from rfcore.camera import Camera
-    from rfcore.field import RadianceField, SplatField
+    from rfcore.field import FieldMetadata, RadianceField, SplatField
     from rfcore.field.stored_splats import ImportedSplats
+    from rfcore.raster.gaussians import Gaussians
     from rfcore.train.levels import LevelFitConfig
     from rfcore.views import PosedPicture
     from rfedge.fields.check import Fit
+
+EXPORTED = (".ply", ".spz", ".glb", ".usdc", ".usda")
 
 
 @dataclass(frozen=True)
 class FieldImport:
     """Read splats: a .ply of INRIA, gsplat, nerfstudio, OpenSplat, Brush, SuperSplat or
-    LichtFeld, also a compressed one, or a .spz."""
+    LichtFeld, also a compressed one, a .spz, or glTF (.glb)."""
 
     splats: Annotated[Path, Positional, SPLATS]
     """The file, told by its content; properties of a .ply are found by name, text and binary
@@ -54,7 +57,7 @@ class FieldImport:
     """East, north and up of the tile's origin, m, subtracted in float64; default: zero, or the
     median splat where that is farther than 10 km from it."""
     up: Up | None = None
-    """Axis that points up; default: z."""
+    """Axis that points up; default: as the file says, else z."""
     antialiased: bool = False
     """The field was trained with antialiased rasterization (gsplat, Mip-Splatting), and the file's
     SplatRenderMode comment does not say so."""
@@ -82,7 +85,7 @@ class FieldImport:
             raise InvalidInput("out", f"{out} is the file that is read: name another")
         read = self._splats()
         antialiased = self.antialiased or read.antialiased is True
-        up = None if self.up is None else UPS[self.up]
+        up = read.up if self.up is None else UPS[self.up]
         metadata = FieldMetadata(self.name, read.tile_origin, antialiased=antialiased, up=up)
         field = SplatField(read.splats, metadata, threads=self.threads)
         field = field if self.raw else field.compressed()
@@ -123,19 +126,21 @@ class FieldImport:
             origin = origin or chosen_origin(back.apply(splats.means.astype(float)), notes)
             splats = moved(splats, back.localised(origin))
         splats = reordered(splats, most_important_first(visible_area(splats)))
-        return replace(read, splats=splats, tile_origin=origin, notes=tuple(notes))
+        up = read.up if back is None else None
+        return replace(read, splats=splats, tile_origin=origin, notes=tuple(notes), up=up)
 
 
 @dataclass(frozen=True)
 class FieldExport:
-    """Write a field's splats for other programs, as .ply or .spz."""
+    """Write a field's splats for other programs, as .ply, .spz, .glb or OpenUSD."""
 
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name."""
-    out: Annotated[Path, arg(metavar="FILE.ply|.spz")]
+    out: Annotated[Path, arg(metavar="FILE.ply|.spz|.glb|.usdc")]
     """The file to write; positions are relative to the tile's origin. As .ply in the property order
     of the reference implementation, with a SplatRenderMode comment that says how the splats are to
-    be drawn; as .spz, lossy and a tenth of the size, for viewers in a browser."""
+    be drawn; as .spz, lossy and a tenth of the size, for viewers in a browser; as .glb, glTF with
+    KHR_gaussian_splatting; as .usdc or .usda, OpenUSD (extra usd)."""
     detail: float = 1.0
     """Share of the splats: 1, 0.5, 0.25 or 0.1."""
     spz_version: Literal[3, 4] = 4
@@ -145,29 +150,46 @@ class FieldExport:
     def run(self) -> None:
         """Load and export."""
         from rfcore.camera import TileOrigin
-        from rfcore.field import Quality, write_ply
+        from rfcore.field import Quality
         from rfcore.field.quality import splats_at_detail
-        from rfcore.field.spz import write_spz
 
-        is_spz = self.out.suffix == ".spz"
-        if not is_spz:
-            _check_out(self.out, ".ply")
+        _check_out(self.out, *EXPORTED)
         detail = Quality(self.detail).detail
         field = open_splats(self.field, threads=1)
         splats = splats_at_detail(field.gaussians, field.levels, detail)
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        antialiased, origin = field.metadata.antialiased, field.metadata.tile_origin
-        if is_spz:
-            write_spz(self.out, splats, antialiased=antialiased, version=self.spz_version)
-        else:
-            write_ply(self.out, splats, antialiased=antialiased)
+        axes = self._write(splats, field.metadata)
         print(f"{self.out}: {len(splats):,} splats of SH degree {splats.sh_degree}")
-        if is_spz:
-            stated = "as it states" if self.spz_version == 4 else "which version 3 cannot state"
-            print(f"axes: RDF, those of a .ply, {stated}")
+        if axes:
+            print(f"axes: {axes}")
+        if field.metadata.antialiased and self.out.suffix in (".usdc", ".usda"):
+            print("they are drawn antialiased, which OpenUSD cannot state")
+        origin = field.metadata.tile_origin
         if origin != TileOrigin():
             place = f"{origin.east_m:.10g} {origin.north_m:.10g} {origin.up_m:.10g}"
             print(f"positions are relative to {place} m, the tile's origin")
+
+    def _write(self, splats: Gaussians, metadata: FieldMetadata) -> str:
+        """Write the file; return what is to be said of its axes."""
+        from rfcore.field import write_ply
+        from rfcore.field.gltf import write_glb
+        from rfcore.field.spz import write_spz
+        from rfcore.field.usd import write_usd
+        from rfcore.vertical import direction
+
+        antialiased, up = metadata.antialiased, metadata.vertical
+        if self.out.suffix == ".ply":
+            write_ply(self.out, splats, antialiased=antialiased)
+            return ""
+        if self.out.suffix == ".spz":
+            write_spz(self.out, splats, antialiased=antialiased, version=self.spz_version)
+            stated = "as it states" if self.spz_version == 4 else "which version 3 cannot state"
+            return f"RDF, those of a .ply, {stated}"
+        if self.out.suffix == ".glb":
+            write_glb(self.out, splats, antialiased=antialiased, up=up)
+            return f"the field's vertical, {direction(up)}, is +Y, as glTF says"
+        write_usd(self.out, splats, up=up)
+        return f"the field's vertical, {direction(up)}, is z, as the file states"
 
 
 @dataclass(frozen=True)
@@ -361,12 +383,12 @@ def _cameras_of(drive: Path, field: SplatField) -> list[Camera]:
     return [picture.camera for picture in open_drive(drive, field).pictures]
 
 
-def _check_out(out: Path, suffix: str) -> None:
+def _check_out(out: Path, *suffixes: str) -> None:
     """Raise ``InvalidInput`` unless ``out`` is named as the format it will hold."""
     from rfcore.errors import InvalidInput
 
-    if out.suffix != suffix:
-        raise InvalidInput("out", f"{out} must end in {suffix}")
+    if out.suffix not in suffixes:
+        raise InvalidInput("out", f"{out} must end in {' or '.join(suffixes)}")
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class Twin:
     """Look at a server's street, or at one field, in a browser, until Ctrl-C."""
 
     target: Annotated[str | None, Positional, arg(metavar="HOST:PORT|FIELD")] = None
-    """Address of a mec-server; or a field (archive, name, .ply, .spz) to look at without one."""
+    """Address of a mec-server; or a field (archive, name, .ply, .spz, .glb) without one."""
     http: Annotated[str, ADDRESS] = "127.0.0.1:8080"
     """Address to serve the page at; port 0 takes a free one. For browsers elsewhere give a
     token."""
@@ -125,7 +125,9 @@ class Twin:
             read = read_splat_file(Path(target))
             for note in read.notes:
                 print(note, file=sys.stderr)
-            metadata = FieldMetadata("", read.tile_origin, antialiased=read.antialiased is True)
+            metadata = FieldMetadata(
+                "", read.tile_origin, antialiased=read.antialiased is True, up=read.up
+            )
             return SplatField(read.splats, metadata, threads=self.threads)
         return open_field(target, threads=self.threads)
 

@@ -1,4 +1,4 @@
-"""Read a .ply or .spz from anywhere in a process without rights, which hands back arrays.
+"""Read splats from anywhere in a process without rights, which hands back arrays.
 
 The file is opened here and read there: ``python -m rfedge.fields.confined_reader CONFINEMENT FILE
 MAX NAME EAST NORTH UP`` confines itself, says so with one byte, and writes to its standard output
@@ -22,7 +22,7 @@ from typing import IO, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import TileOrigin
+from rfcore.camera import TileOrigin, Vec3
 from rfcore.confinement.confine import Confinement, ProcessLimits, confine
 from rfcore.confinement.start import BEST_FIRST, READY, confined_reader
 from rfcore.errors import BackendUnavailable, FieldFormatError, RfedgeError
@@ -54,6 +54,7 @@ class Answer:
     antialiased: bool | None
     origin: tuple[float, float, float]
     notes: tuple[str, ...]
+    up: Vec3 | None
 
 
 def read_splats(
@@ -130,7 +131,11 @@ def _received(
         splats = Gaussians(*(_array(answer, shape) for shape in shapes))
         notes = tuple(printable(str(note)) for note in said.notes)
         antialiased = None if said.antialiased is None else bool(said.antialiased)
-        return ImportedSplats(splats, antialiased, TileOrigin(*map(float, said.origin)), notes)
+        origin = TileOrigin(*map(float, said.origin))
+        if said.up is None:
+            return ImportedSplats(splats, antialiased, origin, notes)
+        x, y, z = map(float, said.up)
+        return ImportedSplats(splats, antialiased, origin, notes, (x, y, z))
     except (ValueError, TypeError, EOFError) as error:
         answer.close()
         raise FieldFormatError(f"{path}: {_ended(process)}") from error
@@ -182,7 +187,7 @@ def main() -> None:
         splats = read.splats
         said = Answer(
             *(len(splats), splats.sh.shape[1], read.antialiased),
-            *(astuple(read.tile_origin), read.notes),
+            *(astuple(read.tile_origin), read.notes, read.up),
         )
         answer.write(json.dumps(vars(said)).encode() + b"\n")
         for part in fields(splats):

@@ -162,6 +162,27 @@ def test_an_exported_spz_says_its_axes_and_comes_back(here, splats, capsys, vers
     np.testing.assert_allclose(back.gaussians.means[order_back], splats.means[order], atol=2.0**-12)
 
 
+def test_an_exported_glb_is_upright_and_comes_back_as_the_same_field(here, splats, capsys):
+    field = SplatField(splats, FieldMetadata(antialiased=True, up=(0.0, -1.0, 0.0)))
+    save_field(field, here / "a.rff")
+    FieldExport(Path("a.rff"), here / "a.glb").run()
+    assert "vertical, -y, is +Y" in capsys.readouterr().out
+    FieldImport(here / "a.glb", "back", raw=True).run()
+    back = load_field(field_path("back"))
+    assert (back.metadata.antialiased, back.metadata.up) == (True, (0.0, -1.0, 0.0))
+    assert "drawn antialiased, as the file says" in capsys.readouterr().out
+    order, order_back = (np.lexsort(g.means.T) for g in (splats, back.gaussians))
+    np.testing.assert_array_equal(back.gaussians.means[order_back], splats.means[order])
+
+
+def test_an_exported_usd_says_its_axes_and_what_it_cannot_state(here, splats, capsys):
+    save_field(SplatField(splats, FieldMetadata(antialiased=True)), here / "a.rff")
+    FieldExport(Path("a.rff"), here / "a.usdc").run()
+    said = capsys.readouterr().out
+    assert "vertical, z, is z" in said
+    assert "antialiased, which OpenUSD cannot state" in said
+
+
 def test_what_is_left_out_of_an_import_is_said(here, splats, capsys):
     write_ply(here / "a.ply", splats)
     data = (here / "a.ply").read_bytes()

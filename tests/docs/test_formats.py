@@ -4,7 +4,9 @@
 the order and with the comments of a program. To renew the page, print ``table()``.
 """
 
+import base64
 import gzip
+import json
 import re
 import struct
 from collections.abc import Callable
@@ -18,6 +20,7 @@ import pytest
 from docs.pages import Page
 from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError, FieldFormatError
+from rfcore.field.gltf import encode_glb
 from rfcore.field.ply_table import read_vertices, write_vertices
 from rfcore.field.splat_ply import write_ply
 from rfcore.field.spz import COORDINATE_SYSTEM, encode_spz
@@ -157,6 +160,16 @@ def text(folder: Path) -> bytes:
     return as_text(layout(INRIA)(folder))
 
 
+def gltf(_: Path) -> bytes:
+    """Text, with the binary part as a data URI."""
+    glb = encode_glb(SOURCE, antialiased=True, up=(0.0, 0.0, 1.0))
+    size = struct.unpack_from("<I", glb, 12)[0]
+    root = json.loads(glb[20 : 20 + size])
+    data = base64.b64encode(glb[28 + size :]).decode()
+    root["buffers"][0]["uri"] = f"data:application/gltf-buffer;base64,{data}"
+    return json.dumps(root).encode()
+
+
 CONVERTED = "refused, with the command of splat-transform"
 UNSTATED = "axes: the file states none"
 SPLATS = [
@@ -272,11 +285,36 @@ SPLATS = [
         "python -m zipfile",
     ),
     Row(
-        ".glb, .gltf",
+        ".glb (KHR_gaussian_splatting)",
+        "splat-transform 2.7.1 (its file)",
+        "read; +Y up is turned to the axes of a .ply",
+        export("splat-transform-2.7.1.glb"),
+        "half round z",
+    ),
+    Row(
+        ".glb (KHR_gaussian_splatting)",
+        "rfedge",
+        "read and written; +Y up, turned back",
+        content(lambda _: encode_glb(SOURCE, antialiased=True, up=(0.0, 0.0, 1.0))),
+        "turned back",
+    ),
+    Row(
+        ".gltf (KHR_gaussian_splatting)",
         "any",
-        "refused: export as .ply or .spz",
-        content(lambda _: b"glTF" + bytes(9)),
-        "export the splats",
+        "read, if its buffers are data URIs",
+        content(gltf, "a.gltf"),
+        "turned back",
+    ),
+    Row(
+        ".glb, other kernels, linear colours, SPZ or meshopt inside",
+        "any",
+        "refused",
+        content(
+            lambda _: encode_glb(SOURCE, antialiased=True, up=(0.0, 0.0, 1.0)).replace(
+                b'"srgb_', b'"lin__'
+            )
+        ),
+        "colorSpace is 'lin__rec709_display'",
     ),
     Row(
         ".ply, 2D Gaussians",

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from rfcore.errors import FieldFormatError
+from rfcore.field.gltf import encode_glb
 from rfcore.field.splat_file import looks_like_splats, read_splat_file
 from rfcore.field.splat_ply import write_ply
 from rfcore.field.spz import encode_spz
@@ -37,6 +38,7 @@ def zipped(*names: str, content: bytes = b"") -> bytes:
 def test_the_suffix_does_not_matter(tmp_path, name):
     write_ply(tmp_path / "plain.ply", SPLATS)
     contents = [(tmp_path / "plain.ply").read_bytes()]
+    contents += [encode_glb(SPLATS, antialiased=True, up=(0.0, 0.0, 1.0))]
     contents += [encode_spz(SPLATS, antialiased=True, version=version) for version in (3, 4)]
     for content in contents:
         (tmp_path / name).write_bytes(content)
@@ -55,9 +57,9 @@ def test_the_suffix_does_not_matter(tmp_path, name):
         ("a.zip", zipped("meta.json"), r": cp \S*a\.zip \S*a\.sog && npx .*a\.sog \S*a\.ply"),
         ("a.sogs", zipped("means_l.webp"), r"cp \S*a\.sogs \S*a\.sog && npx"),
         ("a.ply", zipped("point_cloud.ply"), r"is a zip archive; unpack it"),
-        ("a.glb", b"glTF" + bytes(20), r"is glTF, which is not read; export"),
-        ("a.gltf", b"{}", r"is glTF"),
-        ("a.ply", b"PLY\n", r"neither a \.ply nor a \.spz by its content: it begins with b'PLY"),
+        ("a.glb", b"glTF" + bytes(20), r"is glTF 0, whose first chunk is 0x0; 2 is read"),
+        ("a.gltf", b"{}", r"is no valid glTF: its JSON has no asset"),
+        ("a.ply", b"PLY\n", r"no \.ply, \.spz or \.glb by its content: it begins with b'PLY"),
         ("a.spz", b"", r"is empty"),
         ("a.spz", gzip.compress(b"ply\n", mtime=0), r"does not begin with NGSP"),
     ],

@@ -14,6 +14,7 @@ from rfcore.confinement.confine import Confinement
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import BackendUnavailable, FieldFormatError
 from rfcore.field import read_splat_file, write_ply
+from rfcore.field.gltf import encode_glb
 from rfcore.field.spz import encode_spz
 from rfcore.raster.gaussians import Gaussians
 from rfedge.fields.confined_reader import read_confined
@@ -52,6 +53,7 @@ def written(ply: Path) -> dict[str, bytes]:
     return {
         "text .ply": as_text(ply),
         "compressed .ply": compressed_ply(splats),
+        "glb": encode_glb(splats, antialiased=True, up=(0.6, 0.0, 0.8)),
         "spz 3": encode_spz(splats, antialiased=True, version=3),
         "spz 4": zstandard,
         "spz 4 in RUB": zstandard[: at - 3] + b"\x04" + zstandard[at - 2 :],

@@ -14,6 +14,7 @@ from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.field import FieldMetadata, SplatField, render_field_view, write_ply
 from rfcore.field.archive import PREFIX, encode_archive
+from rfcore.field.gltf import encode_glb
 from rfcore.field.spz import encode_spz
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.raster.gaussians import Gaussians
@@ -117,6 +118,7 @@ def put_files() -> None:
         data = encode_spz(field(zipped).gaussians, antialiased=True)
         put("spz", name, data)
         put("spz", f"{name}-plain", gzip.decompress(data))
+    put("gltf", "glb", encode_glb(field(1).gaussians, antialiased=True, up=(0.0, 0.0, 1.0)))
     label = VersionLabel("dusk", FIELD_ID, 2, 19.5)
     published, area = "2026-11-01T12:00:00+00:00", Area((-1.0, -2.0), (3.0, 4.0))
     each = (TileVersion(FIELD_ID, published), TileVersion("cd" * 32, published, label))

@@ -35,6 +35,7 @@ from rfcore.errors import (
 )
 from rfcore.field import render_field_view
 from rfcore.field.archive import ALIGN_BYTES, PREFIX, decode_archive
+from rfcore.field.gltf import read_open_gltf
 from rfcore.field.splat_ply import read_open_ply
 from rfcore.field.spz import read_open_spz
 from rfcore.field.store import decode_field
@@ -200,6 +201,12 @@ def spz(data: bytes) -> None:
             read_open_spz(Path("fuzz.spz"), io.BytesIO(one), FEW_BYTES)
 
 
+def gltf(data: bytes) -> None:
+    """Splats of other programs, as glTF: a .glb, or JSON."""
+    with suppress(FieldFormatError):
+        read_open_gltf(Path("fuzz.gltf"), io.BytesIO(data), FEW_BYTES)
+
+
 def tiles(data: bytes) -> None:
     """The manifest of a folder of fields."""
     _as_file(MANIFEST, data, lambda path: read_publication(path.parent))
@@ -230,6 +237,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "archive": archive,
     "ply": ply,
     "spz": spz,
+    "gltf": gltf,
     "tiles": tiles,
     "transforms": transforms,
     "drive": drive,
