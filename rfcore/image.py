@@ -217,20 +217,27 @@ def write_png(path: Path, rgb: Rgb) -> None:
     write_whole(path, png_bytes(rgb))
 
 
-def png_bytes(rgb: Rgb) -> bytes:
-    """Return uint8 [H, W, 3] as a PNG file."""
-    return _encode("png", {}, av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), "rgb24"))
+def png_bytes(rgb: Rgb, level: int | None = None) -> bytes:
+    """Return uint8 [H, W, 3] as a PNG file; ``level``: of zlib, 1 to 9."""
+    options = {} if level is None else {"compression_level": str(level)}
+    return _encode("png", options, av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), "rgb24"))
 
 
-def jpeg_bytes(rgb: Rgb) -> bytes:
-    """Return uint8 [H, W, 3] as a JPEG file with chroma of half size, about quality 90."""
+def jpeg_bytes(rgb: Rgb, quantiser: int | None = None) -> bytes:
+    """Return uint8 [H, W, 3] as a JPEG file with chroma of half size, about quality 90.
+
+    ``quantiser``, 1 to 31, instead of that; then the bytes are the same on every machine.
+    """
     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), "rgb24").reformat(
         format="yuvj420p",
         dst_colorspace=Colorspace.ITU601,
         dst_color_range=ColorRange.JPEG,
         interpolation=EXACT_CONVERSION,
     )
-    return _encode("mjpeg", {"qmin": JPEG_QUANTISER, "qmax": JPEG_QUANTISER}, frame)
+    options = {"qmin": JPEG_QUANTISER, "qmax": JPEG_QUANTISER}
+    if quantiser is not None:
+        options = {"qmin": str(quantiser), "qmax": str(quantiser), "dct": "int"}
+    return _encode("mjpeg", options, frame)
 
 
 def _encode(codec: str, options: dict[str, str], frame: av.VideoFrame) -> bytes:

@@ -48,6 +48,9 @@ class Twin:
     fields: Annotated[Path, FOLDER] = Path("out/twin/fields")
     """Folder for fields of servers."""
     connection: OmitArgPrefixes[TwinConnection] = TwinConnection()
+    sensorsim: Annotated[str | None, ADDRESS] = None
+    """Loopback address at which simulators may ask for pictures: SensorsimService of AlpaSim and
+    NuRec (docs/how-to/simulators.md)."""
     ready_file: Annotated[Path | None, arg(metavar="FILE")] = None
     """Write the page's address here once it can be opened."""
 
@@ -58,7 +61,8 @@ class Twin:
 
         token = self.token or os.environ.get("RFEDGE_TWIN_TOKEN")
         web = WebSettings(Address.parse("http", self.http), token)
-        run_twin(TwinRun(web, self._source(), self.ready_file, self.until_exit_of))
+        sensorsim = Address.parse("sensorsim", self.sensorsim) if self.sensorsim else None
+        run_twin(TwinRun(web, self._source(), self.ready_file, self.until_exit_of, sensorsim))
 
     def _source(self) -> Callable[[TwinScene], Source]:
         from rfcore.errors import InvalidInput

@@ -69,6 +69,11 @@ class DriveSource:
         self._field_id = ""
 
     @property
+    def pictures(self) -> Sequence[PosedPicture]:
+        """The drive's pictures."""
+        return self._pictures
+
+    @property
     def live(self) -> None:
         """None: a drive shows neither objects nor views."""
 

@@ -29,7 +29,9 @@ from rfcore.perception.objects import CameraKey
 from rfcore.wire.address import Address
 from rfcore.wire.twin_render import ViewRequest
 from rfedge.twin.comparing import Comparer
+from rfedge.twin.drive_source import DriveSource
 from rfedge.twin.scene import Board, Message, Reader, TwinScene
+from rfedge.twin.sensorsim import Sensorsim
 from rfedge.twin.server_source import ServerSource
 
 with needs("twin"):
@@ -377,6 +379,8 @@ class TwinRun:
     """Written with the page's address once it can be opened."""
     until_exit_of: int | None = None
     """A process at whose end this one ends, too."""
+    sensorsim: Address | None = None
+    """Where simulators ask for pictures."""
 
 
 def run_twin(run: TwinRun) -> None:
@@ -399,6 +403,7 @@ async def _serve(run: TwinRun) -> None:
         print(f"open {address}", flush=True)
         if run.ready_file is not None:
             write_whole(run.ready_file, address.encode())
+        simulators = await _for_simulators(run, scene, source)
         tasks = [
             asyncio.create_task(source.run()),
             asyncio.create_task(comparer.run()),
@@ -412,7 +417,19 @@ async def _serve(run: TwinRun) -> None:
         finally:
             for task in tasks:
                 task.cancel()
+            if simulators is not None:
+                await simulators.stop()
             await page.stop()
+
+
+async def _for_simulators(run: TwinRun, scene: TwinScene, source: Source) -> Sensorsim | None:
+    """Serve simulators, if that is asked for; they are offered a drive's cameras and poses."""
+    if run.sensorsim is None:
+        return None
+    drive = source.pictures if isinstance(source, DriveSource) else ()
+    service = Sensorsim(run.sensorsim, scene, drive)
+    print(f"simulators: {await service.start()}", flush=True)
+    return service
 
 
 async def _exit_of(pid: int) -> None:
