@@ -1,11 +1,15 @@
 """Picture files: what is read is what was stored, and what cannot be read is said."""
 
+import ctypes
+from pathlib import Path
+from platform import machine
+
 import cv2
 import numpy as np
 import pytest
 
 from rfcore.errors import DatasetError, InvalidInput
-from rfcore.image import I420, Rgb, jpeg_bytes, read_rgb, write_png
+from rfcore.image import I420, Rgb, jpeg_bytes, png_bytes, read_rgb, write_png
 
 
 def noise(height: int, width: int) -> Rgb:
@@ -57,6 +61,25 @@ def test_planes_are_packed_and_unpacked(size_px):
     assert I420.unpacked(size_px, packed).digest() == picture.digest()
     with pytest.raises(InvalidInput, match="bytes for"):
         I420.unpacked(size_px, packed + b"x")
+
+
+def test_files_are_the_same_without_the_processors_vector_instructions():
+    """FFmpeg's own switch turns them off; without a quantiser its JPEG differs by them."""
+    maps = Path("/proc/self/maps").read_text().split()
+    libavutil = ctypes.CDLL(next(word for word in maps if "libavutil" in word))
+    rgb = cv2.GaussianBlur(noise(120, 160), (5, 5), 0)
+
+    def files() -> list[bytes]:
+        return [*(jpeg_bytes(rgb, each) for each in (1, 5, 31)), png_bytes(rgb, 1)]
+
+    wanted, usual = files(), jpeg_bytes(rgb)
+    libavutil.av_force_cpu_flags(0)
+    try:
+        assert files() == wanted
+        assert jpeg_bytes(rgb) != usual or machine() != "x86_64", "the switch has no effect"
+    finally:
+        libavutil.av_force_cpu_flags(-1)
+    assert len(wanted[0]) > len(wanted[1]) > len(wanted[2])
 
 
 def test_a_jpeg_is_read_without_a_colour_cast(tmp_path):

@@ -398,12 +398,12 @@ async def _serve(run: TwinRun) -> None:
     with ThreadPoolExecutor(1, "compare") as executor:
         comparer = Comparer(scene, executor)
         source = run.source(scene)
+        simulators = await _for_simulators(run, scene, source)
         page = TwinWeb(run.web, board, scene, comparer, live=source.live)
         address = await page.start()
         print(f"open {address}", flush=True)
         if run.ready_file is not None:
             write_whole(run.ready_file, address.encode())
-        simulators = await _for_simulators(run, scene, source)
         tasks = [
             asyncio.create_task(source.run()),
             asyncio.create_task(comparer.run()),

@@ -4,7 +4,9 @@ carla-driver-interface holds AlpaSim's messages as they were published; it is th
 and numbers. AlpaSim itself was not run.
 """
 
+import asyncio
 import math
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -18,7 +20,7 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.errors import InvalidInput
-from rfcore.field import FieldMetadata, SplatField
+from rfcore.field import FieldMetadata, SplatField, save_field
 from rfcore.image import rgb_from_bytes, rgb_from_colour
 from rfcore.lens import BrownLens, FisheyeLens
 from rfcore.metrics import psnr
@@ -433,6 +435,28 @@ async def test_a_scene_goes_by_its_fields_name_and_none_is_there_before_it_is_lo
             await Client(channel).picture(request())
     await service.stop()
     assert refused.value.code() is grpc.StatusCode.UNAVAILABLE
+
+
+async def test_the_command_serves_simulators_beside_the_page(wall, tmp_path):
+    save_field(wall, tmp_path / "painted.rff")
+    words = ["--http", "127.0.0.1:0", "--sensorsim", "127.0.0.1:0"]
+    command = [sys.executable, "-m", "rfedge", "twin", str(tmp_path / "painted.rff"), *words]
+    process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+    try:
+        name, _, address = (await process.stdout.readline()).decode().strip().partition(": ")
+        assert name == "simulators"
+        async with grpc.aio.insecure_channel(address) as channel:
+            client = Client(channel)
+            async with asyncio.timeout(60):
+                while not (await client.call("get_available_scenes", common.Empty())).scene_ids:
+                    pass  # the field is being read
+            shown = await client.picture(request())
+        k = Intrinsics(64, 48, 40.0, 42.0, 32.0, 24.0)
+        camera = Camera(k, middle(float32(EYE), float32(EYE)))
+        np.testing.assert_array_equal(shown, rgb_from_colour(wall.render_colour(camera)))
+    finally:
+        process.terminate()
+        assert await process.wait() == 0
 
 
 def test_the_port_is_this_machines_alone():
