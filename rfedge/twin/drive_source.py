@@ -81,6 +81,7 @@ class DriveSource:
         """Show until cancelled; raises ``DatasetError`` for a picture that cannot be read."""
         self._scene.connection("waiting", f"{self._name} is being read", self._clock())
         await asyncio.gather(self._show_fields(), self._show_pictures())
+        await asyncio.Event().wait()  # one field without pictures is shown for good
 
     async def _show_fields(self) -> None:
         if not isinstance(self._field, FollowedFile):
