@@ -205,6 +205,7 @@ class Sender:
                 yield from self._probe(now)
             case Timer.RTO:
                 self._time_out(now)
+                yield self._again(self._sent[0], now)
         yield from self.packets(now)
 
     # --- sending

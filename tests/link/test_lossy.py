@@ -1,8 +1,10 @@
 """TCP over packets that are lost: when bytes arrive, by algebra, and how many, by formula."""
 
+import heapq
 import itertools
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from random import Random
 from typing import Any
 
@@ -12,7 +14,7 @@ from rfcore.errors import InvalidInput
 from rfcore.link.lossy import HEADER_BYTES, LossyLink, PacketLoss
 from rfcore.link.plan import Arrival, LinkPlan, delivery_times
 from rfcore.link.shaper import Connection, Link, LinkProfile
-from rfcore.link.tcp import MSS_BYTES
+from rfcore.link.tcp import MSS_BYTES, AckPacket, Receiver, Sender
 
 DELAY_S, RATE_BPS = 0.02, 12e6
 RTT_S, PACKET_S = 2 * DELAY_S, 8 * (MSS_BYTES + HEADER_BYTES) / RATE_BPS
@@ -103,6 +105,55 @@ def test_every_byte_arrives_once_and_in_order(percent: float, burst: float) -> N
     assert order == list(range(200))
     assert link.held_bytes == 0
     assert link.room_bytes(1e9) == link.profile.queue_limit_bytes
+
+
+def arrives_over_delays_that_vary(seed: int) -> bool:
+    """Write messages to a sender whose packets and acknowledgements are lost, or late by up to half
+    a second; return whether all bytes arrived. Asserts that a sender that waits has a timer."""
+    random, sender, receiver = Random(seed), Sender(RTT_S), Receiver()
+    events: list[tuple[float, int, Callable[[float], None]]] = []
+    numbers = itertools.count()
+
+    def at(at_s: float, happen: Callable[[float], None]) -> None:
+        heapq.heappush(events, (at_s, next(numbers), happen))
+
+    def passes(now: float, share: float, happen: Callable[[float], None]) -> None:
+        if random.random() >= share:
+            at(now + DELAY_S + random.choice((0, 0, 0, 0, 0.5)) * random.random(), happen)
+
+    def send(packets: Iterable[tuple[int, int]], now: float) -> None:
+        for start, end in packets:
+            passes(now, 0.15, partial(arrive, start, end))
+        assert sender.timer_s is not None or receiver.upto == sender.sent_upto
+
+    def arrive(start: int, end: int, now: float) -> None:
+        ack = receiver.received(start, end, now) or receiver.acknowledgement()
+        passes(now, 0.1, partial(take, ack))
+
+    def take(ack: AckPacket, now: float) -> None:
+        sender.acked(ack, now)
+        send(sender.packets(now), now)
+
+    def write(now: float) -> None:
+        sender.written(random.choice((60, 300, 4000)), now)
+        send(sender.packets(now), now)
+
+    for number in range(200):
+        at(0.1 * number, write)
+    now = 0.0
+    while now < 3600 and (events or sender.timer_s is not None):
+        if sender.timer_s is not None and (not events or sender.timer_s <= events[0][0]):
+            now = max(now, sender.timer_s)
+            send(sender.expired(now), now)
+        else:
+            now, _, happen = heapq.heappop(events)
+            happen(now)
+    return receiver.upto == sender.written_upto
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_sender_that_waits_has_a_timer_and_everything_arrives(seed: int) -> None:
+    assert arrives_over_delays_that_vary(seed)
 
 
 @pytest.mark.parametrize("percent", [0.5, 1.0, 2.0])
