@@ -1,5 +1,9 @@
 """Names and numbers that both ends rely on agree with the generated code and with each other."""
 
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
 import grpc
 import pytest
 
@@ -47,3 +51,45 @@ def test_the_server_permits_the_keepalive_of_the_client_with_margin() -> None:
     client, server = dict(CHANNEL_OPTIONS), dict(SERVER_OPTIONS)
     permitted_ms = server["grpc.http2.min_ping_interval_without_data_ms"]
     assert 2 * permitted_ms <= client["grpc.keepalive_time_ms"]
+
+
+async def _echo(requests: Any, context: Any) -> AsyncIterator[bytes]:  # noqa: ARG001
+    async for request in requests:
+        yield request
+
+
+async def test_a_connection_that_answers_nothing_any_more_is_given_up() -> None:
+    is_silent = False
+
+    async def forward(
+        reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, answers: bool
+    ) -> None:
+        while data := await reader.read(65536):
+            if not (answers and is_silent):
+                writer.write(data)
+        writer.close()
+
+    server = grpc.aio.server(options=SERVER_OPTIONS)
+    echo = grpc.stream_stream_rpc_method_handler(_echo)
+    handler = grpc.method_handlers_generic_handler("test", {"Echo": echo})
+    server.add_generic_rpc_handlers((handler,))
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+
+    async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        far_reader, far_writer = await asyncio.open_connection("127.0.0.1", port)
+        async with asyncio.TaskGroup() as both:
+            both.create_task(forward(reader, far_writer, answers=False))
+            both.create_task(forward(far_reader, writer, answers=True))
+
+    proxy = await asyncio.start_server(connected, "127.0.0.1", 0)
+    address = f"127.0.0.1:{proxy.sockets[0].getsockname()[1]}"
+    async with grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
+        call = channel.stream_stream("/test/Echo")()
+        await call.write(b"x")
+        assert await call.read() == b"x"
+        is_silent = True
+        with pytest.raises(grpc.aio.AioRpcError, match="UNAVAILABLE"):
+            await asyncio.wait_for(call.read(), 15)
+    proxy.close()
+    await server.stop(None)
