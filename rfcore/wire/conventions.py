@@ -61,8 +61,8 @@ miss the promised one."""
 
 CHANNEL_OPTIONS: Final[Options] = (
     *SHARED_OPTIONS,
-    # A connection that answers nothing is given up after 5 s; TCP that repairs losses of 5 % takes up
-    # to 2.5 s. Since gRPC 1.60 the ping's timeout decides (60 s by default), keepalive's does not.
+    # A connection that answers nothing is given up after 5 s; TCP that repairs losses of 5 % takes
+    # up to 2.5 s. The ping's timeout decides (60 s by default), keepalive's does not (gRPC 1.85).
     ("grpc.keepalive_time_ms", 2_000),
     ("grpc.http2.ping_timeout_ms", 3_000),
     ("grpc.keepalive_permit_without_calls", 1),
