@@ -13,6 +13,7 @@ from lab.benchmark import EvalBenchmark
 from lab.city import PlanCity
 from lab.classes import EvalClasses
 from lab.cold_start import EvalColdStart
+from lab.detect import EvalDetect
 from lab.head import EvalHead
 from lab.intra_size import EvalIntraSize
 from lab.latency import EvalLatency
@@ -35,6 +36,7 @@ Verb = (
     | Annotated[PlanCity, subcommand("city")]
     | Annotated[EvalClasses, subcommand("classes")]
     | Annotated[EvalColdStart, subcommand("cold-start")]
+    | Annotated[EvalDetect, subcommand("detect")]
     | Annotated[MakeFeed, subcommand("feed")]
     | Annotated[EvalHead, subcommand("head")]
     | Annotated[EvalIntraSize, subcommand("intra-size")]

@@ -18,7 +18,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse lossy-link robust ladder latency head compare compare-small)
 	cp $^ lab/results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live cold-start world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark $(if $(DATA),detect) rig live cold-start world paper)
 	cp $(filter %.json,$^) lab/results/
 	$(MAKE) -f lab/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -158,6 +158,10 @@ $(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA
 			$(if $(DATA),$(foreach of,empty vehicles,yardstick-$(of)@30=$(YARD)/transforms_drive30_$(of).json$(COMMA)$(OUT)/yardstick-$(k)k.rff)))
 $(OUT)/classes.json: $(call drive,people) | $(OUT)
 	$(LAB) classes $(SAMPLE) people@10=$< --cells $(OUT)/classes --out $@
+# Of a detector that does not ship: FastestDet.onnx of dog-qiuqiu/FastestDet, in DATA/weights.
+$(OUT)/detect.json: $(call drive,people) $(if $(DATA),$(RESIDENTIAL)/drive/transforms.json $(OUT)/residential.rff $(OUT)/loop.rff $(OUT)/city.rff) | $(OUT)
+	$(LAB) detect $(SAMPLE) people@10=$< sample-vehicles@10=$(VEHICLES) $(REAL) $(RESIDENTIAL_DRIVE) \
+		--detector $(DATA)/weights/FastestDet.onnx --cells $(OUT)/detect --out $@
 $(OUT)/never-worse.json: | $(OUT)
 	$(RFEDGE) eval never-worse $(SAMPLE) $(NOON) --decimated $(NOON) --cells $(OUT)/never-worse --out $@
 $(OUT)/lossy-link.json: | $(OUT)

@@ -13,6 +13,7 @@ from lab.adapt.measure import REPORT as ADAPT
 from lab.benchmark.definition import REPORT as BENCHMARK
 from lab.classes.measure import REPORT as CLASSES
 from lab.cold_start import REPORT as COLD_START
+from lab.detect.measure import REPORT as DETECT
 from lab.head import REPORT as HEAD
 from lab.latency.report import REPORT as LATENCY
 from lab.live.report import REPORT as LIVE
@@ -39,7 +40,7 @@ KINDS: Mapping[str, Report] = {
     report.kind: report
     for report in (
         *REPORTS[:4],
-        *(PAPER, BENCHMARK, CLASSES, ADAPT, HEAD, LATENCY, ROBUST, TCP, LOCALISE, SIZING),
+        *(PAPER, BENCHMARK, CLASSES, DETECT, ADAPT, HEAD, LATENCY, ROBUST, TCP, LOCALISE, SIZING),
         *(LOADS, RATIO, RIG, LIVE, COLD_START, WORLD, SCALE, FAULTS, ATTACKS, STABILITY, SOAK),
         *REPORTS[4:],
     )

@@ -23,6 +23,7 @@ from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import StreamHeader
 from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.photometric import Photometric
 from rfcore.codec.references import INTRA, Reference, References, is_temporal, references_name
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
@@ -117,9 +118,9 @@ class FieldCoder:
 
     ``references``, ``photometric`` and ``relight`` None leave them to the encoder.
 
-    With ``foregrounds``, bool [H, W] a frame, the notes have the luma's squared error there. They
-    have the references, the bytes of the slice, whether the render was relit (1 or 0), and the
-    digest of the whole message.
+    ``qp_maps``, one a frame, code parts finer or coarser. With ``foregrounds``, bool [H, W] a
+    frame, the notes have the luma's squared error there. They have the references, the bytes of
+    the slice, whether the render was relit (1 or 0), and the digest of the whole message.
     """
 
     def __init__(
@@ -134,6 +135,7 @@ class FieldCoder:
         relight: bool | None = None,
         points: Sequence[float] = CRFS,
         foregrounds: Sequence[NDArray[np.bool_]] = (),
+        qp_maps: Sequence[QpMap] = (),
     ) -> None:
         self.name = name
         self.points = tuple(points)
@@ -142,6 +144,7 @@ class FieldCoder:
         self._rendered = rendered
         self._effort = effort
         self._foregrounds = foregrounds
+        self._qp_maps = qp_maps
         if references == WITHOUT_FIELD:
             photometric = ()
         self._choice = FrameChoice(references, photometric=photometric, relight=relight)
@@ -163,16 +166,15 @@ class FieldCoder:
         light += "" if choice.relight is None else f", relit {choice.relight}"
         return (
             f"{self._program}; effort {self._effort}, references {references}, light {light}, "
-            f"views {self._rendered.digest}, foregrounds {self._foregrounds_digest()}"
+            f"views {self._rendered.digest}, foregrounds {_digest(self._foregrounds)}, "
+            f"qp {_digest(qp_map.offsets for qp_map in self._qp_maps)}"
         )
-
-    def _foregrounds_digest(self) -> str:
-        return _digest(mask for mask in self._foregrounds) if self._foregrounds else "none"
 
     def of_run(self, run: slice) -> FieldCoder:
         """Return the coder of the frames ``run`` alone."""
         part = copy(self)
         part._rendered, part._foregrounds = self._rendered.of_run(run), self._foregrounds[run]
+        part._qp_maps = self._qp_maps[run]
         return part
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
@@ -216,6 +218,8 @@ class FieldCoder:
     def _inputs(self, frames: Sequence[I420]) -> Iterator[FrameInput]:
         for index, frame in enumerate(frames):
             choice = self._choice if index else self._first_choice
+            if self._qp_maps:
+                choice = replace(choice, qp_map=self._qp_maps[index])
             yield FrameInput(frame, self._rendered.views[index], choice)
 
 

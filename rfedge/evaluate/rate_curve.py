@@ -180,7 +180,7 @@ def bd_rate_interval(
     count = len(anchor[0].frame_bytes)
     figures = []
     for _ in range(repetitions):
-        frames = _drawn_blocks(first, count, rng)
+        frames = drawn_blocks(first, count, rng)
         try:
             curves = curve(anchor, frames), curve(test, frames)
             figures.append(bd_rate_percent(*curves, _reached(curves, window_db, least_share)))
@@ -204,7 +204,7 @@ def _reached(curves: Sequence[RateCurve], window_db: Window, least_share: float)
     return (low_db, high_db)
 
 
-def _drawn_blocks(first: int, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def drawn_blocks(first: int, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
     """Return as many frames as there are from ``first`` on, drawn in blocks of their root."""
     wanted = count - first
     length = max(1, round(math.sqrt(wanted)))
