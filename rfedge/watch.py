@@ -14,18 +14,18 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, wait
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import av
 
-from rfcore.errors import InvalidInput
+from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
 from rfcore.image import png_bytes
 from rfcore.wire.twin import (
@@ -34,9 +34,14 @@ from rfcore.wire.twin import (
     Subscription,
     TwinPicture,
 )
+from rfcore.wire.twin_render import ObjectsRequest, ObjectsSeen
 from rfcore.wire.values import check_name
 from rfcore.wire.waits import waiting
 from rfedge.video import bt709_stream, even_frame
+
+if TYPE_CHECKING:
+    from rfcore.field import RadianceField
+    from rfedge.mcap_file import McapFile
 
 TICKS_PER_S = 90_000
 """Resolution of a video's times, as in MPEG systems."""
@@ -169,6 +174,7 @@ class WatchSettings:
     vehicle_ids: frozenset[str] = frozenset()
     folder: Path | None = None
     video: Path | None = None
+    mcap: Path | None = None
     encoding: str | None = None
     pictures: int | None = None
 
@@ -177,7 +183,8 @@ class WatchSettings:
             check_name("vehicle", name)
         if self.pictures is not None and self.pictures < 1:
             raise InvalidInput("pictures", f"{self.pictures} must be at least 1")
-        if self.video is not None and self.subscription.encoding is not PictureEncoding.I420:
+        shown = self.video or self.mcap
+        if shown is not None and self.subscription.encoding is not PictureEncoding.I420:
             raise InvalidInput("encoding", f"{self.encoding} makes no video; leave it out")
         if self.folder is not None and self.subscription.encoding is PictureEncoding.NONE:
             raise InvalidInput("encoding", "none leaves nothing to keep; leave it out")
@@ -188,23 +195,88 @@ class WatchSettings:
         encoding = PictureEncoding.NONE
         if self.encoding is not None:
             encoding = PictureEncoding(self.encoding)
-        elif self.video is not None:
+        elif self.video is not None or self.mcap is not None:
             encoding = PictureEncoding.I420
         elif self.folder is not None:
             encoding = PictureEncoding.JPEG
         return Subscription(self.vehicle_ids, encoding)
 
 
-def watch(settings: WatchSettings, source: PictureSource) -> None:
+ObjectsOf = Callable[[ObjectsRequest], Iterator[ObjectsSeen]]
+"""Yields a server's objects on the ground of one field."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What is watched: pictures and, if they are there, objects; the field as an MCAP shows it."""
+
+    pictures: PictureSource
+    objects: ObjectsOf | None = None
+    field: RadianceField | None = None
+
+
+class TwinMcap:
+    """Keeps pictures and objects in an MCAP file (``rfedge.mcap_file``)."""
+
+    def __init__(self, file: McapFile, objects: ObjectsOf | None) -> None:
+        self._file, self._objects = file, objects
+        self._fields: set[str] = set()
+
+    def keep(self, picture: TwinPicture) -> None:
+        """Add a picture, and from then on the objects of its field."""
+        from rfedge.mcap_file import ShownPicture
+
+        metrics = {
+            "age_ms": picture.age_ns / 1e6,
+            "decoding_ms": picture.decoding_ns / 1e6,
+            "payload_bytes": picture.payload_bytes,
+            "missed": picture.skipped,
+            "sequence": picture.sequence,
+        }
+        shown = ShownPicture(
+            *(picture.vehicle_id, picture.camera_id, picture.capture_time_ns, picture.planes),
+            *(picture.intrinsics, picture.pose, picture.field_id, metrics),
+        )
+        self._file.show(shown, time.time_ns())
+        if self._objects is not None and picture.field_id not in self._fields:
+            self._fields.add(picture.field_id)
+            threading.Thread(
+                target=self._follow, args=(self._objects, picture.field_id), daemon=True
+            ).start()
+
+    def _follow(self, objects: ObjectsOf, field_id: str) -> None:
+        try:
+            for seen in objects(ObjectsRequest(field_id=field_id)):
+                self._file.show_objects(field_id, seen.objects, seen.time_ns, time.time_ns())
+        except RfedgeError as error:
+            _say(f"no objects: {error}")
+
+
+@contextmanager
+def _opened_mcap(path: Path, watched: Watched) -> Iterator[TwinMcap]:
+    from rfedge.mcap_file import McapFile
+
+    with McapFile(path, watched.field) as file:
+        yield TwinMcap(file, watched.objects)
+    if file.late:
+        _say(f"{path}: {file.late} pictures left out, not taken later than the ones before them")
+
+
+def watch(settings: WatchSettings, source: PictureSource | Watched) -> None:
     """Print and keep what ``source`` shows, until it ends, is stopped, or enough was seen.
 
     Files are whole when it returns or raises. Raises ``RfedgeError`` if the source is not there or
     refuses.
     """
     pictures = 0
+    watched = source if isinstance(source, Watched) else Watched(source)
+    source = watched.pictures
     with ExitStack() as stack:
         folder = PictureFolder(settings.folder) if settings.folder else None
         video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
+        mcap = None
+        if settings.mcap is not None:
+            mcap = stack.enter_context(_opened_mcap(settings.mcap, watched))
         wait_for = stack.enter_context(waiting("a connection", _say_wait))
 
         def connected(may_see: str) -> None:
@@ -223,6 +295,8 @@ def watch(settings: WatchSettings, source: PictureSource) -> None:
                 folder.keep(message)
             if video is not None:
                 video.keep(message)
+            if mcap is not None:
+                mcap.keep(message)
             pictures += 1
             if pictures == settings.pictures:
                 return
@@ -237,7 +311,7 @@ def _say_wait(what: str, waited_s: float) -> None:
     _say(f"waiting for {what} for {waited_s:.0f} s")
 
 
-def watch_until_stopped(settings: WatchSettings, source: PictureSource) -> None:
+def watch_until_stopped(settings: WatchSettings, source: PictureSource | Watched) -> None:
     """Watch to the end, or until SIGINT or SIGTERM; to be called from the main thread.
 
     After the first signal files are completed. If that takes longer than ``FINISH_S``, because
@@ -254,7 +328,7 @@ def watch_until_stopped(settings: WatchSettings, source: PictureSource) -> None:
         ended = _started(settings, source)
         while not ended.done() and not signals:
             wait([ended], timeout=LOOK_EVERY_S)
-        source.stop()
+        (source.pictures if isinstance(source, Watched) else source).stop()
         finish_until_s = time.monotonic() + FINISH_S
         while not ended.done():
             if len(signals) > 1 or time.monotonic() > finish_until_s:
@@ -267,7 +341,7 @@ def watch_until_stopped(settings: WatchSettings, source: PictureSource) -> None:
     ended.result()
 
 
-def _started(settings: WatchSettings, source: PictureSource) -> Future[None]:
+def _started(settings: WatchSettings, source: PictureSource | Watched) -> Future[None]:
     """Watch on a thread of its own; return its outcome."""
     ended = Future[None]()
 

@@ -1,7 +1,7 @@
 """Bags for tests, written by public libraries: rosbags (ROS 2) and mcap (Foxglove's schemas)."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from rfcore.bag_reader import Asked, BagScan, Head, OpenFile, load_everything, read
-from rfcore.camera import Pose
+from rfcore.camera import Pose, TileOrigin
 from rfcore.dataset.bag_records import checked
+from rfcore.views import PosedPicture
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 T0_NS, PERIOD_NS, LATE_NS = 1_767_225_600_000_000_000, 100_000_000, 20_000_000
@@ -253,3 +254,21 @@ def records_here(_, files: list[Any], asked: Asked) -> Iterator[tuple[Head, byte
     for file in opened:
         file.file.close()
     yield from checked(records)
+
+
+def of_pictures(pictures: Sequence[PosedPicture], origin: TileOrigin) -> Recording:
+    """Return posed pictures as a vehicle's camera would have recorded them."""
+    made_of = Recording()
+    mount = transform(T0_NS, "base_link", OPTICAL, BASE_FROM_CAM)
+    made_of.add("/tf_static", transforms(mount), T0_NS)
+    for picture in pictures:
+        ns, k = T0_NS + picture.time_ns, picture.camera.intrinsics
+        world_from_cam = origin.globalise(picture.camera.world_from_cam)
+        world_from_base = world_from_cam.compose(BASE_FROM_CAM.inverse())
+        moved = transform(ns, "map", "base_link", world_from_base)
+        made_of.add("/tf", transforms(moved), ns + LATE_NS)
+        matrix = (k.fx_px, 0, k.cx_px - 0.5, 0, k.fy_px, k.cy_px - 0.5, 0, 0, 1)
+        info = camera_info(ns, (k.width_px, k.height_px), k=matrix)
+        made_of.add("/front/camera_info", info, ns + LATE_NS)
+        made_of.add("/front/image_raw", rgb_image(ns, picture.read()), ns + LATE_NS)
+    return made_of

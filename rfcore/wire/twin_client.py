@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Generator, Iterable
+from collections.abc import AsyncIterator, Callable, Generator, Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
@@ -145,6 +145,23 @@ class TwinClient:
         except grpc.RpcError as error:
             raise twin_error(error) from error
         return rendered_view_from_wire(answer, request.camera.intrinsics)
+
+    def objects(self, request: ObjectsRequest) -> Iterator[ObjectsSeen]:
+        """Yield what stands on the ground of a tile and is not in its field, with each picture.
+
+        Ends when the client is closed.
+        """
+        call = twin_pb2_grpc.TwinServiceStub(self._channel).Objects(
+            objects_request_to_wire(request)
+        )
+        try:
+            for response in call:
+                yield objects_from_wire(response)
+        except grpc.RpcError as error:
+            if not self._stopped:
+                raise twin_error(error) from error
+        finally:
+            call.cancel()
 
     def _wait_for_server(self, call: grpc.Call, tell: Callable[[str], None]) -> None:
         """Wait until the server answers, or the call is cancelled; raise ``RfedgeError``."""

@@ -187,14 +187,15 @@ class _Quality:
 
 @dataclass(frozen=True)
 class Decode:
-    """Decode a .rfv file to PNG files or one MP4, with the field it was encoded against."""
+    """Decode a .rfv file to PNG files, MP4 or MCAP, with the field it was encoded against."""
 
     coded: Annotated[Path, Positional, RFV]
     """The coded drive."""
     field: Annotated[Path, FIELD]
     """The field: an archive (.rff), a name, or MODULE:CLASS (docs/how-to/python.md)."""
-    out: Annotated[Path, arg(metavar="FOLDER|FILE.mp4")]
-    """Folder for the PNG files, or a file ending in .mp4."""
+    out: Annotated[Path, arg(metavar="FOLDER|FILE.mp4|FILE.mcap")]
+    """Folder for the PNG files; or a file ending in .mp4; or in .mcap, with poses, camera and the
+    field's points (docs/how-to/bags.md)."""
     originals: Annotated[Path | None, DATASET] = None
     """The drive that was encoded, to print the PSNR of what is decoded."""
     rate: Annotated[float | None, RATE] = None
@@ -210,13 +211,16 @@ class Decode:
         """Decode every frame; stop at the first packet that fails a check."""
         from mec_server.config import DecoderKind
         from mec_server.decoding.decoders import Decoders
+        from rfcore.extras import require
         from rfcore.raster.renderers import renderer_isa
         from rfcore.wire.drive_file import read_drive
         from rfedge.offline import decode_drive
 
-        film = self.out.suffix.lower() == ".mp4"
-        if not film:
-            check_folder(self.out, "a folder for PNG files, or a video ending in .mp4")
+        film, mcap = (self.out.suffix.lower() == suffix for suffix in (".mp4", ".mcap"))
+        if mcap:
+            require("bags", "mcap", "foxglove_schemas_protobuf")
+        elif not film:
+            check_folder(self.out, "a folder for PNG files, or a file ending in .mp4 or .mcap")
         drive = read_drive(self.coded)
         isa = renderer_isa(self.renderer)
         field = open_field(self.field, threads=self.threads, isa=isa)
@@ -229,6 +233,8 @@ class Decode:
             decoded = decode_drive(drive, field, decoders.open)
             if film:
                 self._write_film(drive, self._compared(decoded, originals))
+            elif mcap:
+                self._write_mcap(drive, field, self._compared(decoded, originals))
             else:
                 self._write_pictures(drive, self._compared(decoded, originals))
 
@@ -268,6 +274,25 @@ class Decode:
         for frame in decoded:
             write_png(self.out / f"{frame.sequence:06d}.png", rgb_from_i420(frame.frame))
         print(f"{self.out}: {len(drive.frames)} frames")
+
+    def _write_mcap(
+        self, drive: CodedDrive, field: RadianceField, decoded: Iterable[DecodedFrame]
+    ) -> None:
+        from rfedge.mcap_file import McapFile, ShownPicture
+
+        camera, vehicle = drive.hello.cameras[0], drive.hello.vehicle_id
+        unfinished = self.out.with_name(f"{self.out.name}.part")
+        with McapFile(unfinished, field) as file:
+            for sent, frame in zip(drive.frames, decoded, strict=True):
+                metrics = {"sequence": frame.sequence, "payload_bytes": len(sent.packet.payload)}
+                shown = ShownPicture(
+                    *(vehicle, camera.camera_id, sent.capture_time_ns, frame.frame),
+                    *(camera.intrinsics, sent.pose, field.field_id, metrics),
+                )
+                file.show(shown, sent.capture_time_ns)
+        unfinished.replace(self.out)
+        late = f"; {file.late} left out, not taken later than the ones before" if file.late else ""
+        print(f"{self.out}: {len(drive.frames) - file.late} frames{late}")
 
     def _write_film(self, drive: CodedDrive, decoded: Iterable[DecodedFrame]) -> None:
         """Write the MP4 at the stated rate, or at the mean rate of the frames' times."""

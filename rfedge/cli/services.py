@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
-from rfedge.arguments import ADDRESS, FOLDER, TwinConnection
+from rfedge.arguments import ADDRESS, FIELD, FOLDER, TwinConnection, open_field
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,11 @@ class Watch:
     """Keep pictures as DIR/VEHICLE/CAMERA/SEQUENCE.png (or .jpg) beside an index.jsonl."""
     mp4: Annotated[Path | None, arg(metavar="FILE.mp4")] = None
     """Keep one camera, the first that is seen, as a video; its times are those of capture."""
+    mcap: Annotated[Path | None, arg(metavar="FILE.mcap")] = None
+    """Keep all cameras as MCAP for Foxglove and the like: video, calibration, poses, metrics, and
+    the objects of a server, which cost it time (docs/how-to/bags.md)."""
+    field: Annotated[Path | None, FIELD] = None
+    """With --mcap: show this field's splats as points; its world is that of the poses."""
     encoding: Literal["none", "i420", "jpeg", "png"] | None = None
     """Form in which pictures are sent; default: i420 (exact) for a video, jpeg for a folder, else
     none."""
@@ -33,12 +38,19 @@ class Watch:
     def run(self) -> None:
         """Watch until the server ends the stream, enough was seen, SIGINT or SIGTERM."""
         from rfcore.errors import InvalidInput
-        from rfedge.watch import WatchSettings, watch_until_stopped
+        from rfcore.extras import require
+        from rfedge.watch import Watched, WatchSettings, watch_until_stopped
 
+        if self.field is not None and self.mcap is None:
+            raise InvalidInput("field", "belongs to --mcap, whose points it becomes")
+        if self.mcap is not None:
+            require("bags", "mcap", "foxglove_schemas_protobuf")
+        field = open_field(self.field) if self.field is not None else None
         settings = WatchSettings(
             vehicle_ids=frozenset(self.vehicle),
             folder=self.dir,
             video=self.mp4,
+            mcap=self.mcap,
             encoding=self.encoding,
             pictures=self.pictures,
         )
@@ -48,13 +60,14 @@ class Watch:
         if urls is not None:
             from rfedge.twin.nats_source import NatsPictures
 
-            watch_until_stopped(settings, NatsPictures(self.connection.nats_servers(urls)))
+            pictures = NatsPictures(self.connection.nats_servers(urls))
+            watch_until_stopped(settings, Watched(pictures, field=field))
             return
         from rfcore.wire.twin_client import TwinClient
 
         tls, allow_insecure = self.connection.tls(), self.connection.allow_insecure
         with TwinClient(self.address or "", tls, allow_insecure=allow_insecure) as client:
-            watch_until_stopped(settings, client)
+            watch_until_stopped(settings, Watched(client, client.objects, field))
 
 
 @dataclass(frozen=True)

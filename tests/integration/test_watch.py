@@ -13,6 +13,7 @@ import av
 import grpc
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from live_server import consumer
 from mec_server.config import ServerBudget, SessionLimits
@@ -37,7 +38,7 @@ from rfcore.wire.twin_render import (
     view_request_to_wire,
 )
 from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
-from rfedge.watch import WatchSettings, watch
+from rfedge.watch import Watched, WatchSettings, watch
 
 CAMERA = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 
@@ -208,7 +209,8 @@ def watch_command() -> Callable[..., Awaitable[list[str]]]:
 
     async def run(address: object, **settings: Any) -> None:
         with TwinClient(str(address)) as client:
-            await asyncio.to_thread(watch, WatchSettings(**settings), client)
+            watched = Watched(client, client.objects)
+            await asyncio.to_thread(watch, WatchSettings(**settings), watched)
 
     return run
 
@@ -238,9 +240,31 @@ async def test_the_watch_command_keeps_pictures_and_a_video(
     assert capsys.readouterr().out.count("cav-1/front 0:") == 4
 
 
+async def test_the_watch_command_keeps_an_mcap_of_what_the_server_shows(
+    serve: Any, travel: Any, watch_command: Any, tmp_path: Path
+) -> None:
+    async with serve() as server:
+        settings = {"mcap": tmp_path / "kept.mcap", "pictures": 4}
+        watching = asyncio.create_task(watch_command(server.address, **settings))
+        while not server.registry.get_sample_value("rfedge_twin_consumers"):
+            await asyncio.sleep(0.01)
+        while not watching.done():
+            await travel(server.address)
+        await watching
+    with (tmp_path / "kept.mcap").open("rb") as file:
+        found = [
+            (schema.name, channel.topic) for schema, channel, _ in make_reader(file).iter_messages()
+        ]
+    kept = {topic: name for name, topic in found}
+    assert kept["/cav-1/front/video"] == "foxglove.CompressedVideo"
+    assert kept["/tf"] == "foxglove.FrameTransform"
+    assert 1 <= [topic for _, topic in found].count("/cav-1/front/video") <= 4
+
+
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [
+        ({"mcap": Path("x.mcap"), "encoding": "jpeg"}, "jpeg makes no video"),
         ({"pictures": 0}, "pictures: 0 must be at least 1"),
         ({"video": Path("x.mp4"), "encoding": "jpeg"}, "jpeg makes no video"),
         ({"folder": Path("x"), "encoding": "none"}, "leaves nothing to keep"),
