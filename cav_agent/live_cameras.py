@@ -32,6 +32,7 @@ from rfcore.dataset.recording import RecordedPoses, RecordingCamera, read_record
 from rfcore.dataset.rig import Rig
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.errors import DatasetError, InvalidInput, RfedgeError
+from rfcore.extras import require
 from rfcore.image import Rgb
 from rfcore.localise.estimate import PoseMeasurement
 from rfcore.views import PosedPicture
@@ -308,9 +309,11 @@ def _open(
     k = recording.camera.intrinsics
     size_px = (k.width_px, k.height_px)
     address = settings.opened_for(size_px)
-    is_file = address.kind is SourceKind.FILE
+    is_file = address.is_file
     if is_file and not Path(address.url).is_file():
         raise InvalidInput("source", f"{address.url} is no file")
+    if address.kind is SourceKind.BAG:
+        require("bags", "mcap", "rosbags", "foxglove_schemas_protobuf")
     reader = ReaderSettings(address, settings.source_timeout_s, config.rate)
     source = LiveSource(
         partial(ReaderProcess, reader),

@@ -7,7 +7,8 @@ open descriptors. A record has
 
 * ``topic``, ``log_ns`` (when it was recorded), ``stamp_ns`` (when it was taken; 0: not stated),
   ``frame``, and ``kind``: image, still, video, camera, transforms, pose or fix; or it is
-* ``topics``, the last one: what every topic holds, and whether the file was cut; or ``wrong``.
+* ``topics``, the last one: what every topic holds, and whether the file was cut; or ``wrong``; or
+* ``idle``: a file that grows has no more yet.
 
 ROS 2 messages are read by the definitions in the file; bags of SQLite from before ROS 2 Iron have
 none, and are read by those of Humble. Messages of Foxglove are read as protobuf.
@@ -51,7 +52,8 @@ LENGTH = struct.Struct("<I")
 READER_BYTES = 3 << 30
 """Address space of the reader, beside three times what a bag of SQLite takes: one is in memory."""
 NS = 1_000_000_000
-FOLLOW_EVERY_S = 0.02
+FOLLOW_EVERY_S, IDLE_EVERY = 0.02, 50
+"""Pause at the end of a file that grows, and pauses after which a record says that it waits."""
 IDR, SLICES = 5, (1, 5)
 """Types of NAL units of H.264: of a key frame, of any frame."""
 
@@ -105,8 +107,9 @@ class RawMessage:
 class ExactFile:
     """A file whose reads are whole; at its end it raises ``BagIsCut``, or waits for more."""
 
-    def __init__(self, file: BinaryIO, follow: bool) -> None:
-        self._file, self._follow = file, follow
+    def __init__(self, file: BinaryIO, follow: bool, idle: Callable[[], None]) -> None:
+        self._file, self._follow, self._idle = file, follow, idle
+        self._pauses = 0
         self._pause = Event()  # whose system call is allowed, where that of sleep is not
 
     def read(self, count: int) -> bytes:
@@ -116,6 +119,9 @@ class ExactFile:
             if not self._follow:
                 raise BagIsCut
             self._pause.wait(FOLLOW_EVERY_S)
+            self._pauses += 1
+            if self._pauses % IDLE_EVERY == 0:
+                self._idle()
             data += self._file.read(count - len(data))
         return data
 
@@ -410,10 +416,10 @@ class OpenFile:
         is_sqlite = os.pread(descriptor, 6, 0) == b"SQLite"
         return OpenFile(name, file, os.fstat(descriptor).st_size, is_sqlite)
 
-    def messages(self, follow: bool) -> Iterator[RawMessage]:
-        """Return the messages."""
+    def messages(self, follow: bool, idle: Callable[[], None]) -> Iterator[RawMessage]:
+        """Return the messages; ``idle`` is called now and then while there are none yet."""
         if not self.is_sqlite:
-            return mcap_messages(ExactFile(self.file, follow))
+            return mcap_messages(ExactFile(self.file, follow, idle))
         if follow:
             raise CannotRead("is a bag of SQLite; only MCAP is followed while it is written")
         return sqlite_messages(bytearray(self.file.read(self.size)))
@@ -422,10 +428,14 @@ class OpenFile:
 def read(scan: BagScan, files: Sequence[OpenFile], write: Callable[[Head, bytes], None]) -> None:
     """Write the records of all files; the last one is ``topics`` or ``wrong``."""
     cut = []
+
+    def idle() -> None:
+        write({"kind": "idle"}, b"")  # fails, and ends the process, where nobody reads any more
+
     for file in files:
         messages = 0
         try:
-            for message in file.messages(scan.asked.follow):
+            for message in file.messages(scan.asked.follow, idle):
                 messages += 1
                 if (record := scan.record(message)) is not None:
                     write(*record)

@@ -24,6 +24,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
 from threading import Condition, Thread
 
 import av
@@ -221,7 +222,7 @@ def _write(*parts: bytes | memoryview) -> None:
 
 
 def _decode(settings: ReaderSettings, newest: NewestFrame) -> None:
-    is_file = settings.address.kind is SourceKind.FILE
+    is_file = settings.address.is_file
     wanted = FrameDecimator(settings.rate_hz)
     try:
         for decoded in _frames(settings):
@@ -230,7 +231,7 @@ def _decode(settings: ReaderSettings, newest: NewestFrame) -> None:
             else:
                 newest.leave_out(is_damaged=decoded is None)
         newest.end(EndRecord("the source ended", is_whole=is_file))
-    except (FFmpegError, OSError, IndexError, ValueError) as error:
+    except (FFmpegError, OSError, IndexError, ValueError, RfedgeError) as error:
         newest.end(EndRecord(f"{type(error).__name__}: {error}"))
 
 
@@ -256,6 +257,9 @@ def _frames(settings: ReaderSettings) -> Iterator[Decoded | None]:
     """Yield frames as they come, ``None`` for one that is damaged or rests on a lost one; those of
     a file when they are due."""
     address = settings.address
+    if address.kind is SourceKind.BAG:
+        yield from _frames_of_bag(address)
+        return
     container = av.open(
         address.url,
         format=address.format,
@@ -290,6 +294,19 @@ def _frames(settings: ReaderSettings) -> Iterator[Decoded | None]:
             pts_ns = None if pts is None else max(0, round(pts * tick_s * NS))
             sender_ns = None if frame.pts is None else sent.get(frame.pts)
             yield Decoded(frame, pts_ns, time.time_ns() - late_ns, sender_ns)
+
+
+def _frames_of_bag(address: SourceAddress) -> Iterator[Decoded | None]:
+    """Yield the pictures of one topic of an MCAP file; their times are those of their stamps."""
+    from rfcore.dataset.bag_records import followed_pictures
+
+    began_ns, first_ns = time.monotonic_ns(), 0
+    pictures = followed_pictures(Path(address.url), address.options.get("topic"))
+    for stamp_ns, is_live, frame in pictures:
+        first_ns = first_ns or stamp_ns
+        if not is_live:
+            _sleep_until(began_ns + stamp_ns - first_ns)
+        yield Decoded(frame, stamp_ns, time.time_ns(), stamp_ns if is_live else None)
 
 
 def _decoded(

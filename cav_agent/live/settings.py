@@ -6,6 +6,8 @@
 ``rtp://HOST:PORT``                 MPEG-TS in RTP, received there; HOST may be a multicast group
 ``udp://HOST:PORT``                 MPEG-TS alone, received there
 ``FILE.sdp``                        RTP as an SDP file (RFC 8866) describes it
+FILE.mcap, FILE.mcap#TOPIC          pictures of an MCAP file: the newest while it is being written,
+                                    else at the speed of its time stamps
 any other path                      a video file, at the speed of its time stamps
 ==================================  ================================================================
 
@@ -39,6 +41,7 @@ class SourceKind(StrEnum):
     RTP = "rtp"
     MPEG_TS = "udp"
     SDP = "sdp"
+    BAG = "bag"
     FILE = "file"
 
 
@@ -59,6 +62,11 @@ class SourceAddress:
     url: str
     format: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def is_file(self) -> bool:
+        """Return whether it is a file, whose pictures have the file's own times."""
+        return self.kind in (SourceKind.FILE, SourceKind.BAG)
 
     @property
     def may_lose(self) -> bool:
@@ -84,8 +92,11 @@ def parse_address(text: str) -> SourceAddress:
         raise InvalidInput(
             "source",
             f"'{without_password(text)}' is none of /dev/videoN, v4l2:DEVICE, rtsp://, rtsps://, "
-            "rtp://HOST:PORT, udp://HOST:PORT, FILE.sdp, a video file",
+            "rtp://HOST:PORT, udp://HOST:PORT, FILE.sdp, FILE.mcap, a video file",
         )
+    path, _, topic = text.partition("#")
+    if path.lower().endswith(".mcap"):
+        return SourceAddress(SourceKind.BAG, path, options={"topic": topic} if topic else {})
     if text.lower().endswith(".sdp"):
         return _network(SourceKind.SDP, text)
     return SourceAddress(
@@ -136,8 +147,8 @@ class LiveSettings:
     """A camera that sends now, instead of a drive's pictures."""
 
     source: str | None = None
-    """Instead of --drive: /dev/videoN, rtsp://..., rtp://HOST:PORT, udp://HOST:PORT, FILE.sdp, or a
-    video file (docs/how-to/cameras.md)."""
+    """Instead of --drive: /dev/videoN, rtsp://..., rtp://HOST:PORT, udp://HOST:PORT, FILE.sdp,
+    FILE.mcap#TOPIC, or a video file (docs/how-to/cameras.md)."""
     camera_file: Path | None = None
     """The source's camera.toml: intrinsics, lens, and the trajectory if there is no --pose-feed."""
     source_timeout_s: float = 5.0

@@ -8,6 +8,7 @@ here, like those of any other dataset.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -21,7 +22,7 @@ from av.error import FFmpegError
 from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import Colorspace
 
-from rfcore.bag_reader import LENGTH, Asked, Head
+from rfcore.bag_reader import LENGTH, PICTURES, Asked, Head
 from rfcore.confinement.start import confined_reader
 from rfcore.dataset.bag_file import bag_files, refuse_other_bags
 from rfcore.errors import BackendUnavailable, DatasetError
@@ -57,7 +58,8 @@ def checked(records: Iterable[tuple[Head, bytes]]) -> Iterator[tuple[Head, bytes
     for head, data in records:
         if head["kind"] == "wrong":
             raise DatasetError(str(head["text"]))
-        yield head, data
+        if head["kind"] != "idle":
+            yield head, data
         if head["kind"] == "topics":
             return
 
@@ -221,3 +223,35 @@ def at_s(head: Head) -> str:
     if head["stamp_ns"]:
         return f"{head['stamp_ns'] / NS:.3f} s"
     return f"log time {head['log_ns'] / NS:.3f} s"
+
+
+FINISHED = b"\x89MCAP0\r\n"
+"""The last bytes of an MCAP file that is written no more."""
+
+
+def followed_pictures(
+    path: Path, topic: str | None = None
+) -> Iterator[tuple[int, bool, av.VideoFrame]]:
+    """Yield time of capture, whether the file is being written, and frame of each picture.
+
+    At the end of a file that is being written it waits for more. ``topic`` None stands for the only
+    one with pictures. Raises ``DatasetError``, also for a second topic.
+    """
+    with path.open("rb") as file:
+        file.seek(-min(len(FINISHED), path.stat().st_size), os.SEEK_END)
+        is_live = file.read() != FINISHED
+    decoder = PictureDecoder(f"{path}: {topic or 'its pictures'}")
+    only = None if topic is None else [topic]
+    for head, data in bag_records(path, only, data=True, follow=is_live):
+        if head["kind"] not in PICTURES:
+            continue
+        topic = topic or head["topic"]
+        if head["topic"] != topic:
+            raise DatasetError(
+                f"{path}: holds several cameras, of {topic} and {head['topic']}: name one, "
+                f"{path}#{topic}"
+            )
+        for made_of, frame in decoder.frames(head, data):
+            yield made_of["stamp_ns"] or made_of["log_ns"], is_live, frame
+    if topic is None:
+        raise DatasetError(f"{path}: holds no pictures")
