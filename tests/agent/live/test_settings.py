@@ -61,7 +61,9 @@ def test_what_is_no_camera_is_refused(text: str, says: str) -> None:
     assert caught.value.args[0].startswith("source")
 
 
-@pytest.mark.parametrize("kind", [kind for kind in SourceKind if kind is not SourceKind.V4L2])
+@pytest.mark.parametrize(
+    "kind", [kind for kind in SourceKind if kind not in (SourceKind.V4L2, SourceKind.BAG)]
+)
 def test_a_source_opens_no_protocol_but_its_own(kind: SourceKind) -> None:
     texts = {SourceKind.SDP: "a.sdp", SourceKind.FILE: "a.mp4"}
     address = parse_address(texts.get(kind, f"{kind}://127.0.0.1:5004"))
