@@ -14,6 +14,11 @@ that range are considered, and the smaller room counts:
 A packet in flight that is overdue raises the cost before its answer does. No clock is read:
 ``now_ns`` is an argument, from any clock that does not run backwards.
 
+A packet that takes twice as long as one as large before it speaks of a rate that fell, or of a
+stall: TCP that repairs a loss. It counts at once, and what was known before it is set aside. The
+next that is large enough to tell decides: if it is as quick as before, there was a stall, and the
+slow one is forgotten.
+
 An answer may wait on the way back behind bytes that the vehicle itself downloads. It still proves
 what was delivered within its whole round trip, but only the time beyond that wait counts as cost.
 """
@@ -21,8 +26,8 @@ what was delivered within its whole round trip, but only the time beyond that wa
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, replace
 
 from rfcore.errors import InvalidInput
 
@@ -62,11 +67,22 @@ class DeliverySample:
     rtt_ns: int
     at_ns: int
     own_ns: int = 0
+    is_stall: bool = False
+    """It may be a stall: it was the first that is slower than those before it."""
 
     @property
     def bytes_per_ns(self) -> float:
         """The rate that the answer proves."""
         return self.size_bytes / self.rtt_ns
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """The samples and means before a packet of ``size_bytes`` that may have been stalled."""
+
+    samples: tuple[DeliverySample, ...]
+    means: tuple[float, float, float]
+    size_bytes: int
 
 
 def _no_downloads(since_ns: int, until_ns: int) -> int:  # noqa: ARG001
@@ -90,6 +106,7 @@ class PathEstimator:
         self._answered_ns: int | None = None
         self._means = (0.0, 0.0, 0.0)
         """Running means of size, of its square, and of size times round trip."""
+        self._before_stall: Knowledge | None = None
 
     @property
     def bytes_in_flight(self) -> int:
@@ -138,8 +155,7 @@ class PathEstimator:
         own_ns = min(rtt_ns, self._own_wait_ns(start_ns, now_ns))
         self._answered_ns = now_ns
         sample = DeliverySample(packet.size_bytes, rtt_ns, now_ns, own_ns)
-        self._add(sample)
-        return sample
+        return self._add(sample)
 
     def room_bytes(self, ready_ns: int, due_ns: int, now_ns: int, share: float = 1.0) -> float:
         """Return how large a packet sent at ``ready_ns`` may be to be answered by ``due_ns``.
@@ -164,8 +180,16 @@ class PathEstimator:
             return 1 / FIRST_NS_PER_BYTE
         return max(sample.bytes_per_ns for sample in self._samples)
 
-    def _add(self, sample: DeliverySample) -> None:
-        if self._outdates_others(sample):
+    def _add(self, sample: DeliverySample) -> DeliverySample:
+        before = self._before_stall
+        if before is not None and sample.size_bytes >= TELLING_SIZE * before.size_bytes:
+            self._before_stall = None
+            if not _outdates(sample, before.samples):
+                self._samples.extend(before.samples)
+                self._means = before.means
+        elif before is None and _outdates(sample, self._samples):
+            self._before_stall = Knowledge(tuple(self._samples), self._means, sample.size_bytes)
+            sample = replace(sample, is_stall=True)
             self._samples.clear()
         if not sample.own_ns or sample.bytes_per_ns > self._proven():
             self._samples.append(sample)
@@ -177,6 +201,7 @@ class PathEstimator:
             keep * mean + (1 - keep) * new for mean, new in zip(self._means, found, strict=True)
         )
         self._means = bytes_, squares, products
+        return sample
 
     def _add_shortest(self, sample: DeliverySample) -> None:
         while self._shortest and self._shortest[-1].rtt_ns >= sample.rtt_ns:
@@ -184,14 +209,6 @@ class PathEstimator:
         self._shortest.append(sample)
         while self._shortest[0].at_ns < sample.at_ns - MIN_RTT_WINDOW_NS:
             self._shortest.popleft()
-
-    def _outdates_others(self, sample: DeliverySample) -> bool:
-        """Return whether a packet no larger than an earlier one took twice its time or more."""
-        return any(
-            other.size_bytes >= sample.size_bytes
-            and 2 * other.rtt_ns <= sample.rtt_ns - sample.own_ns
-            for other in self._samples
-        )
 
     def _cost(self) -> float:
         """Return nanoseconds per byte beyond the shortest round trip: the slope of the line of
@@ -227,3 +244,11 @@ class PathEstimator:
         if before_ns is None:
             return packet.sent_ns
         return max(packet.sent_ns, before_ns - self.min_rtt_ns)
+
+
+def _outdates(sample: DeliverySample, others: Iterable[DeliverySample]) -> bool:
+    """Return whether a packet no larger than an earlier one took twice its time or more."""
+    return any(
+        other.size_bytes >= sample.size_bytes and 2 * other.rtt_ns <= sample.rtt_ns - sample.own_ns
+        for other in others
+    )

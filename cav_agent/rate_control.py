@@ -288,7 +288,8 @@ class RateControl:
         if latency_s <= self._max_delay_s:
             self._share = min(1.0, self._share + GROW)
         elif (
-            latency_s - bytes_s <= self._max_delay_s < beyond_s / PATH_SHARE
+            not (sample is not None and sample.is_stall)
+            and latency_s - bytes_s <= self._max_delay_s < beyond_s / PATH_SHARE
             and frames.answered_s - latency_s >= self._cut_s
         ):
             self._share = max(LEAST_SHARE, SHRINK * self._share)

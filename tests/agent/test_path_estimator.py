@@ -117,6 +117,33 @@ def test_a_fallen_rate_is_believed_at_once() -> None:
     assert path.sustained_bytes(100 * MS, now) < 1.2 * 100 * MS / 26_667
 
 
+TRUE_BYTES = 100 * MS / 800
+
+
+def after_a_slow_one(*sizes: int, ns_per_byte: float) -> float:
+    """Send eight packets at 800 ns a byte, one that takes 300 ms, then ``sizes``; return the bytes
+    that 100 ms are said to carry for ever."""
+    path = PathEstimator()
+    now = answered(path, [8000] * 8, 20, 800)
+    for key, size_bytes in enumerate((8000, *sizes)):
+        path.sent(key, size_bytes, now)
+        now += 300 * MS if key == 0 else round_trip_ns(size_bytes, 20, ns_per_byte)
+        path.answered(key, now)
+    return path.sustained_bytes(100 * MS, now)
+
+
+def test_a_stall_is_forgotten_once_a_packet_is_as_quick_as_before() -> None:
+    assert after_a_slow_one(5000, ns_per_byte=800) > TRUE_BYTES
+
+
+def test_a_small_quick_packet_does_not_tell_a_stall_from_a_fallen_rate() -> None:
+    assert after_a_slow_one(300, ns_per_byte=800) < 0.5 * TRUE_BYTES
+
+
+def test_a_second_slow_packet_confirms_that_the_rate_fell() -> None:
+    assert after_a_slow_one(5000, 5000, ns_per_byte=35_000) < 0.1 * TRUE_BYTES
+
+
 def test_packets_without_answer_are_forgotten() -> None:
     path = PathEstimator()
     path.sent("a", 1000, 0)

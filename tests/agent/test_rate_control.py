@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -19,7 +19,7 @@ from cav_agent.rate_control import LEAST_CAMERA_SHARE, BitDivision, RateControl
 from cav_agent.session import AgentSession
 from rfcore.errors import InvalidInput
 from rfcore.link.plan import read_link
-from rfcore.link.shaper import Link, LinkParts, LinkProfile
+from rfcore.link.shaper import Delivery, Link, LinkParts, LinkProfile
 from rfcore.wire.messages import (
     FrameAddress,
     Hello,
@@ -228,6 +228,46 @@ def test_slow_processors_lower_no_quality(
     coded = [p.crf for p in between(pictures, SETTLING_S, 30) if p.crf is not None]
     assert len(coded) > 50
     assert max(coded) == LOWEST_CRF
+
+
+class RepairedLink(Link[FrameAddress]):
+    """2 Mbit/s on which one packet in ``1 / share`` is lost: TCP repairs it within 50 ms if enough
+    others follow, else after its timeout, and what is behind waits."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__(LinkProfile(2e6, 0.02, 2**40))
+        self._share, self._random, self._last_s = share, Random(4), 0.0
+
+    def push(
+        self, item: FrameAddress, size_bytes: int, now: float, *rest: Any
+    ) -> Delivery[FrameAddress]:
+        delivery = super().push(item, size_bytes, now, *rest)
+        packets = -(-size_bytes // 1448)
+        late_s = 0.0
+        if self._random.random() < 1 - (1 - self._share) ** packets:
+            late_s = 0.05 if packets > 3 and self._random.random() < 0.5 else 0.24
+        self._last_s = max(self._last_s, delivery.due_s + late_s)
+        return replace(delivery, due_s=self._last_s)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.05])
+@pytest.mark.parametrize(("coding_s", "answering_s"), [(0.02, 0.01), (0.2, 0.1)])
+def test_losses_that_tcp_repairs_lower_no_quality(
+    hello: Hello,
+    make_capture: Callable[..., Capture],
+    share: float,
+    coding_s: float,
+    answering_s: float,
+) -> None:
+    """Smaller frames would not be lost less often, nor repaired sooner."""
+    coder = ModelCoder({"front": 7000}, coding_s, spread=0.3)
+    session = AgentSession(hello, rate_control=RateControl(0.5))
+    answering = (0.8 * answering_s, 1.2 * answering_s)
+    world = World(session, RepairedLink(share), coder, answering)
+    captures = [(make_capture(i, i / 5),) for i in range(90 * 5)]
+    pictures = between(list(map(_picture, world.drive(captures))), 10, 90)
+    assert np.median([p.crf for p in pictures if p.crf is not None]) < LOWEST_CRF + 1
+    assert kept(pictures, 0.5) > 0.7
 
 
 @pytest.mark.parametrize("at_server", [False, True])
