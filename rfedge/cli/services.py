@@ -29,8 +29,8 @@ class Watch:
     field: Annotated[Path | None, FIELD] = None
     """With --mcap: show this field's splats as points; its world is that of the poses."""
     encoding: Literal["none", "i420", "jpeg", "png"] | None = None
-    """Form in which pictures are sent; default: i420 (exact) for a video, jpeg for a folder, else
-    none."""
+    """Form in which pictures are sent; default: i420 (exact) for a video or an MCAP, jpeg for a
+    folder, else none."""
     pictures: int | None = None
     """Stop after this many pictures."""
     connection: OmitArgPrefixes[TwinConnection] = TwinConnection()
