@@ -21,7 +21,7 @@ import os
 import sqlite3
 import struct
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
@@ -169,14 +169,25 @@ def sqlite_messages(content: bytearray) -> Iterator[RawMessage]:
             rows = connection.execute(
                 "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             )
-            definitions = {name: (kind, text.encode()) for name, kind, text in rows}
-        for topic, name, form, log_ns, data in connection.execute(
+            definitions = {
+                name: (kind, text.encode()) for name, kind, text in _typed(rows, (str, str, str))
+            }
+        rows = connection.execute(
             "SELECT topics.name, topics.type, topics.serialization_format, timestamp, data "
             "FROM messages JOIN topics ON topics.id = topic_id ORDER BY timestamp, messages.id"
-        ):
+        )
+        for topic, name, form, log_ns, data in _typed(rows, (str, str, str, int, bytes)):
             yield RawMessage(topic, name, form, log_ns, data, *definitions.get(name, ()))
     except sqlite3.Error as error:
         raise CannotRead(f"is no whole bag of SQLite: {error}") from error
+
+
+def _typed(rows: Iterable[Any], types: tuple[type, ...]) -> Iterator[Any]:
+    """Yield rows of these types: any column of SQLite may hold anything."""
+    for row in rows:
+        if tuple(map(type, row)) != types:
+            raise CannotRead(f"is no whole bag of SQLite: {str(row)[:80]} is no row of it")
+        yield row
 
 
 class RosDecoder:

@@ -304,6 +304,14 @@ def test_a_bag_that_is_damaged_is_refused(tmp_path):
         read_source(damaged(tmp_path / "a.db3", b"SQLite format 3\0" + bytes(90)))
 
 
+def test_a_bag_of_sqlite_with_other_types_in_its_columns_is_refused(tmp_path):
+    (bag,) = drive(1).write(tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3")
+    with sqlite3.connect(bag) as connection:
+        connection.execute("UPDATE message_definitions SET encoding = x'00'")
+    with pytest.raises(DatasetError, match="is no row of it"):
+        read_source(bag)
+
+
 def bad_clock(made):
     for i in (0, 1, -300):
         made.add("/back/image_raw", bags.rgb_image(time_ns(i), bags.rgb(0)), time_ns(2))
