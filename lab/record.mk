@@ -165,7 +165,7 @@ $(OUT)/detect.json: $(call drive,people) $(if $(DATA),$(RESIDENTIAL)/drive/trans
 $(OUT)/never-worse.json: | $(OUT)
 	$(RFEDGE) eval never-worse $(SAMPLE) $(NOON) --decimated $(NOON) --cells $(OUT)/never-worse --out $@
 $(OUT)/lossy-link.json: | $(OUT)
-	$(RFEDGE) eval lossy-link --cells $(OUT)/lossy-link --out $@
+	$(RFEDGE) eval lossy-link --rates-mbps 0.5 2 8 --losses 0 1 2 5 --seeds 5 --cells $(OUT)/lossy-link --out $@
 $(OUT)/tcp.json: | $(OUT)  # as root: network namespaces
 	$(LAB) tcp --out $@
 # Ten pictures a second do not tell apart round trips that are shorter than 100 ms.

@@ -341,7 +341,7 @@ def grid_city(
 ) -> City:
     """Return a city of one dense urban cell of ``Assumptions`` a server."""
     assumed = Assumptions()
-    uplink_mbps = assumed.cell_mbps
+    uplink_mbps = assumed.planned_cell_mbps
     layout = (servers, 1, assumed.inter_site_m, cores, uplink_mbps, DOWNLINK_MBPS, busy_weight)
     cells, behind = _hexagons(*layout)
     return City(vehicle, cells, behind, density=density)

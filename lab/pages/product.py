@@ -25,11 +25,14 @@ from rfedge.evaluate.lossy_link.measure import lossy_link_parts
 from rfedge.evaluate.never_worse.measure import NeverWorseRow, never_worse_parts
 from rfedge.report.tables import Column, Table, named_columns, text_table
 from rfedge.results import Result, rows_of
+from rfedge.sizing.estimate import Demand, estimate
+from rfedge.sizing.tables import shipped_tables
 
 # --- compare
 
 README_DRIVES = ("sample-empty", "sample-vehicles", "kitti-loop")
 README_LOSS = "sample-rain"
+README_SIZES = ((640, 360, 10.0), (1280, 720, 15.0), (1920, 1080, 30.0))
 README_FIGURE = "lab/results/figures/bd_rates.svg"
 SUMMARY_COLUMNS = (
     "drive",
@@ -69,7 +72,22 @@ def headline(compared: Result, harder: Result) -> str:
             )
         )
     heads = ("drive", "bits against x264 with our tools (95 %)", "against the best of all rivals")
-    return f"{sentence}\n\n{text_table(heads, lines).markdown()}\n\n![bits saved]({README_FIGURE})"
+    table = text_table(heads, lines).markdown()
+    return f"{sentence}\n{_larger()}\n\n{table}\n\n![bits saved]({README_FIGURE})"
+
+
+def _larger() -> str:
+    """Return what ``rfedge size`` says of larger pictures and faster cameras."""
+    told = []
+    for width_px, height_px, hz in README_SIZES:
+        sizing = estimate(Demand(1, width_px, height_px, hz, 34.0), shipped_tables())
+        mbps = {row.codec: row.mbps for row in sizing.estimates}
+        saved_percent = 100 * (1 - mbps["rfedge"] / mbps["x264"])
+        told.append(f"{saved_percent:.0f} % at {width_px}x{height_px} and {hz:g} Hz")
+    return (
+        "Larger pictures and faster cameras save less: on the sample street "
+        f"[`rfedge size`](docs/how-to/sizing.md) says {', '.join(told)}."
+    )
 
 
 def _interval(row: CompareRow) -> Sequence[float]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table as RichTable
 
-    from rfedge.sizing.estimate import Demand, Sizing
+    from rfedge.sizing.estimate import Demand, Estimate, FleetEstimate, Sizing
     from rfedge.sizing.tables import SizingTables
 
 
@@ -110,44 +110,53 @@ def print_sizing(console: Console, sizing: Sizing) -> None:
 
     demand, assumed = sizing.demand, sizing.assumptions
     console.print(f"A vehicle with {_cameras(demand)}")
-    table = Table(box=box.SIMPLE, pad_edge=False)
+    table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
     names = ["codec", "Mbit/s", "95 %", "cores", "at server", "a cell", "a km2"]
     if demand.delay_ms is not None:
-        names.insert(3, "link")
+        names[3:3] = ["link", "least"]
     for number, name in enumerate(names):
         table.add_column(name, justify="right" if number else "left", no_wrap=True)
     for row in sizing.estimates:
         cells = [
             row.codec,
             f"{row.mbps:.2f}",
-            f"{row.low_mbps:.3g}..{row.high_mbps:.3g}",
+            _interval(row),
             f"{row.vehicle_cores:.2f}",
             f"{row.server_cores:.2f}",
             f"{row.vehicles_per_cell}",
             f"{row.vehicles_per_km2:.0f}",
         ]
         if demand.delay_ms is not None:
-            cells.insert(3, "-" if row.link_mbps is None else f"{row.link_mbps:.2f}")
+            links = (row.link_mbps, row.least_link_mbps)
+            cells[3:3] = ["none" if mbps is None else f"{mbps:.2f}" for mbps in links]
         table.add_row(*cells)
     console.print(table)
     if demand.vehicles > 1:
         console.print(_fleet_table(sizing))
     console.print(
-        "Mbit/s of one vehicle with transport; cores on the vehicle and at the server; vehicles "
-        "that a cell and a km2 carry."
+        "Mbit/s of one vehicle with transport; 95 %: interval, if this size and rate were "
+        "measured; cores on the vehicle and at the server; vehicles that a cell and a km2 carry."
     )
     if demand.delay_ms is not None:
         console.print(
-            f"link: Mbit/s with which {100 * demand.share:g} % of the frames are reconstructed "
-            f"within {demand.delay_ms:g} ms, and of which the mean rate uses "
-            f"{100 * assumed.utilisation:g} % at most."
+            f"least: the slowest link, Mbit/s, that brings {100 * demand.share:g} % of the frames "
+            f"measured within {demand.delay_ms:g} ms. link: at least that, and at most "
+            f"{100 * assumed.utilisation:g} % used by the mean rate, as other streets vary more."
         )
     console.print(f"Measured on {sizing.measured_on}; steady state, without first frames.")
     console.print(f"Measured: {sizing.measured_at}; logarithms are interpolated between them.")
+    console.print(f"Cores and times were measured on {sizing.measured_machine}.")
+    stated = (
+        f"{assumed.bandwidth_mhz:g} MHz x {assumed.uplink_share:g} up x "
+        f"{assumed.bits_per_hz:g} bit/s/Hz"
+        if assumed.cell_mbps is None
+        else f"{assumed.cell_mbps:g} Mbit/s"
+    )
+    divisor = "Mbit/s" if demand.delay_ms is None else "least"
     console.print(
-        f"Cell: {assumed.bandwidth_mhz:g} MHz x {assumed.uplink_share:g} up x "
-        f"{assumed.bits_per_hz:g} bit/s/Hz x {assumed.utilisation:g} = {assumed.cell_mbps:.1f} "
-        f"Mbit/s; {assumed.cells_per_km2:.0f} cells a km2; {assumed.overhead_percent:g} % transport"
+        f"Cell: {stated} x {assumed.utilisation:g} = {assumed.planned_cell_mbps:.1f} Mbit/s, over "
+        f"{divisor}: vehicles a cell; {assumed.cells_per_km2:.0f} cells a km2; "
+        f"{assumed.overhead_percent:g} % transport"
     )
     for note in sizing.beyond:
         console.print(f"[yellow]Note[/]: {note}")
@@ -161,6 +170,10 @@ def _cameras(demand: Demand) -> str:
         f"{cameras} of {demand.width_px}x{demand.height_px} px at {demand.hz:g} Hz, "
         f"{demand.psnr_db:g} dB luma PSNR"
     )
+
+
+def _interval(row: Estimate | FleetEstimate) -> str:
+    return "-" if row.low_mbps is None else f"{row.low_mbps:.3g}..{row.high_mbps:.3g}"
 
 
 def _fleet_table(sizing: Sizing) -> RichTable:
@@ -179,19 +192,19 @@ def _fleet_table(sizing: Sizing) -> RichTable:
         cells = [
             row.codec,
             f"{row.mbps:.1f}",
-            f"{row.low_mbps:.3g}..{row.high_mbps:.3g}",
+            _interval(row),
             f"{row.server_cores:.1f}",
             "-" if row.cells is None else f"{row.cells}",
         ]
         if demand.delay_ms is not None:
-            cells.insert(3, "-" if row.link_mbps is None else f"{row.link_mbps:.1f}")
+            cells.insert(3, "none" if row.link_mbps is None else f"{row.link_mbps:.1f}")
         table.add_row(*cells)
     return table
 
 
 def write_sizing_plot(sizing: Sizing, path: Path) -> None:
     """Draw the mean rate with its interval, and the link that keeps the delay, of all vehicles with
-    each codec; the title and the lines below the picture have the conditions."""
+    each codec; the title and the lines below the picture have the conditions and all notes."""
     import matplotlib as mpl
     from matplotlib import pyplot as plt
 
@@ -199,21 +212,34 @@ def write_sizing_plot(sizing: Sizing, path: Path) -> None:
     from rfedge.report.charts import BLUE, GREY, INK, STYLE
 
     demand, fleet = sizing.demand, sizing.fleet
-    vehicles = "1 vehicle" if demand.vehicles == 1 else f"{demand.vehicles} vehicles"
-    conditions = [f"Measured on {sizing.measured_on}.", *sizing.warnings]
+    many = demand.vehicles > 1
+    vehicles = f"{demand.vehicles} vehicles, each" if many else "1 vehicle"
+    conditions = [
+        f"Measured on {sizing.measured_on}; steady state, without first frames.",
+        *(
+            ["No 95 % interval: this size and rate were not measured together."]
+            if any(row.low_mbps is None for row in fleet)
+            else ()
+        ),
+        *(f"Note: {note}." for note in sizing.beyond),
+        *(f"Warning: {warning}." for warning in sizing.warnings),
+    ]
     if demand.delay_ms is not None:
         used = f"the mean rate uses {100 * sizing.assumptions.utilisation:g} % of it at most"
         in_time = f"{100 * demand.share:g} % of the frames within {demand.delay_ms:g} ms"
         conditions.insert(0, f"Link: {in_time}; {used}.")
     with mpl.rc_context({**STYLE, "axes.grid.axis": "x"}):
         figure, axes = plt.subplots(figsize=(7.2, 0.6 * len(fleet) + 1.2))
-        places = range(len(fleet))
-        mbps = [row.mbps for row in fleet]
-        reach = [
-            [row.mbps - row.low_mbps for row in fleet],
-            [row.high_mbps - row.mbps for row in fleet],
-        ]
-        axes.barh(places, mbps, 0.5, xerr=reach, color=BLUE, ecolor=INK, label="mean rate, 95 %")
+        for place, row in enumerate(fleet):
+            is_late = demand.delay_ms is not None and row.link_mbps is None
+            label, alpha = "" if place else "mean rate", 0.35 if is_late else 1.0
+            axes.barh(place, row.mbps, 0.5, color=BLUE, alpha=alpha, label=label)
+            if row.low_mbps is not None:
+                ends = (row.low_mbps, row.high_mbps)
+                axes.plot(ends, (place, place), color=INK, label="" if place else "95 %")
+            if is_late:
+                text = f"no link keeps {demand.delay_ms:g} ms"
+                axes.text(row.high_mbps or row.mbps, place, f"  {text}", va="center", color=INK)
         linked = [(k, row.link_mbps) for k, row in enumerate(fleet) if row.link_mbps is not None]
         if linked:
             axes.barh(
@@ -224,11 +250,12 @@ def write_sizing_plot(sizing: Sizing, path: Path) -> None:
                 zorder=0.5,
                 label="link",
             )
-        axes.set_yticks(places, [row.codec for row in fleet])
+        axes.set_yticks(range(len(fleet)), [row.codec for row in fleet])
         axes.invert_yaxis()
-        axes.set_xlabel("uplink, Mbit/s with transport")
+        of_all = f" of all {demand.vehicles} vehicles" if many else ""
+        axes.set_xlabel(f"uplink{of_all}, Mbit/s with transport")
         axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1), fontsize=9)
-        axes.set_title(f"Uplink of {vehicles}\n{_cameras(demand)}", loc="left", fontsize=9)
+        axes.set_title(f"Uplink of {vehicles} with\n{_cameras(demand)}", loc="left", fontsize=9)
         axes.annotate(
             "\n".join(textwrap.fill(text, COLUMNS) for text in conditions),
             (0, 0),

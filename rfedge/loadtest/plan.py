@@ -312,7 +312,8 @@ def judge(measured: Measured, bounds: Bounds) -> Verdict:
     checks = (
         (
             len(measured.vehicles) < measured.wanted_vehicles,
-            f"{measured.wanted_vehicles - len(measured.vehicles)} vehicles were not admitted",
+            f"{measured.wanted_vehicles - len(measured.vehicles)} of {measured.wanted_vehicles} "
+            "vehicles were not admitted",
         ),
         (p99_ms > bounds.deadline_ms, f"p99 {p99_ms:.0f} ms above {bounds.deadline_ms:g} ms"),
         (

@@ -252,16 +252,14 @@ def run_loads(
     runs: list[Run] = []
 
     def held(vehicles: int) -> bool:
-        console.print(f"[bold]{vehicles}[/] vehicles, {load.mode}, {load.hz:g} Hz")
+        console.print(f"[bold]{_vehicles(vehicles)}[/], {load.mode}, {load.hz:g} Hz")
         times = f"{load.warm_up_s:g} s of warm-up, {load.duration_s:g} s counted"
         with working(f"starting them, {times}"):
             runs.append(run_load(replace(load, vehicles=vehicles), bed))
-        verdict = runs[-1].verdict
-        outcome = "held" if verdict.held else "not held: " + "; ".join(verdict.broken)
-        console.print(f"  {outcome}; limit: {verdict.limited_by}")
+        console.print(f"  {_outcome(runs[-1])}")
         if runs[-1].row.server_growth_mb is None:
             console.print(f"  memory is not judged: it settles for {SETTLING_S:g} s first")
-        return verdict.held
+        return runs[-1].verdict.held
 
     if find_limit:
         largest_held(load.vehicles, held)
@@ -323,9 +321,18 @@ def _vehicles(count: int) -> str:
     return "1 vehicle" if count == 1 else f"{count} vehicles"
 
 
+def _outcome(run: Run) -> str:
+    """Return in a line whether a load was held, what became of its vehicles, and the limit."""
+    verdict, row = run.verdict, run.row
+    counts = ((row.refused, "refused"), (row.failed, "failed"), (row.reduced, "at a lower rate"))
+    ended = [f"{_vehicles(count)} {what}" for count, what in counts if count]
+    parts = [*verdict.broken, *ended, f"limit: {verdict.limited_by}"]
+    return ("held; " if verdict.held else "not held: ") + "; ".join(parts)
+
+
 def print_runs(console: Console, result: LoadResult) -> None:
-    """Print a row for each run."""
-    columns = ("vehicles", "held", "p50 ms", "p99 ms", "on time %", "server cores", "limit")
+    """Print a row for each run, and why the smallest load that was not held was not."""
+    columns = ("vehicles", "held", "p50 ms", "p99 ms", "on time %", "server cores")
     rows = [
         [
             str(run.load.vehicles),
@@ -334,11 +341,12 @@ def print_runs(console: Console, result: LoadResult) -> None:
             f"{run.verdict.p99_ms:.1f}",
             f"{run.verdict.on_time_percent:.2f}",
             f"{run.row.server_cores:.2f}",
-            run.verdict.limited_by,
         ]
         for run in result.runs
     ]
     text_table(columns, rows, result.headline()).print(console)
+    run = next((run for run in result.runs if not run.verdict.held), result.runs[-1])
+    console.print(f"{_vehicles(run.load.vehicles)} {_outcome(run)}", highlight=False)
 
 
 def write_load_result(result: LoadResult, out: Path) -> None:

@@ -11,7 +11,7 @@ frames are repeated.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle, islice
 from typing import Annotated
@@ -19,7 +19,14 @@ from typing import Annotated
 from tyro.conf import arg
 
 from rfcore.errors import InvalidInput
-from rfedge.sizing.tables import CameraDemand, SizingCell, SizingTables, check_reach, log_at
+from rfedge.sizing.tables import (
+    CameraDemand,
+    SizingCell,
+    SizingTables,
+    check_reach,
+    is_measured,
+    log_at,
+)
 
 INSTANTS = 400
 """Length of the simulation, in pictures of a camera."""
@@ -85,6 +92,8 @@ class Assumptions:
     bits_per_hz: float = 5.4
     """Average uplink spectral efficiency of a cell, bit/s/Hz; ITU-R M.2410 requires 5.4 in dense
     urban and 1.6 in rural areas."""
+    cell_mbps: float | None = None
+    """Mbit/s of a cell's uplink; replaces its bandwidth, uplink share and bit/s/Hz."""
     utilisation: float = 0.7
     """Share of a cell's capacity to plan with, and of a vehicle's link that the mean rate may use:
     frames of other streets vary more than those of the short clips that were measured."""
@@ -100,14 +109,18 @@ class Assumptions:
         for name in ("uplink_share", "utilisation"):
             if not 0 < getattr(self, name) <= 1:
                 raise InvalidInput(name, f"{getattr(self, name):g} is outside 0..1")
+        if self.cell_mbps is not None and not 0 < self.cell_mbps <= 1e6:
+            raise InvalidInput("cell-mbps", f"{self.cell_mbps:g} is outside 0..1e6")
         for name in ("overhead_percent", "propagation_ms"):
             if not 0 <= getattr(self, name) <= 1000:
                 raise InvalidInput(name, f"{getattr(self, name):g} is outside 0..1000")
 
     @property
-    def cell_mbps(self) -> float:
+    def planned_cell_mbps(self) -> float:
         """Throughput of a cell's uplink that may be planned with, Mbit/s."""
-        return self.bandwidth_mhz * self.uplink_share * self.bits_per_hz * self.utilisation
+        stated = self.cell_mbps
+        cell_mbps = self.bandwidth_mhz * self.uplink_share * self.bits_per_hz
+        return (cell_mbps if stated is None else stated) * self.utilisation
 
     @property
     def cells_per_km2(self) -> float:
@@ -119,17 +132,18 @@ class Assumptions:
 class Estimate:
     """One codec's needs for a vehicle: Mbit/s with transport, and cores at either end.
 
-    ``mbps`` is the mean rate, with the 95 % interval of the nearest cell. ``least_link_mbps``: the
-    link that keeps the delay for the frames that were measured; ``link_mbps``: the link to plan
-    with, which the mean rate also uses to ``Assumptions.utilisation`` at most. Both are None unless
-    a delay is asked for and can be kept. A cell, whose capacity has that margin already, holds as
-    many vehicles as its uplink carries of the least link, or of the mean rate.
+    ``mbps`` is the mean rate. Its 95 % interval is that of the measured frames; None at a size or
+    rate that was not measured, where nobody knows the error. ``least_link_mbps``: the link that
+    keeps the delay for the frames that were measured; ``link_mbps``: the link to plan with, which
+    the mean rate also uses to ``Assumptions.utilisation`` at most. Both are None unless a delay is
+    asked for and can be kept. A cell, whose capacity has that margin already, holds as many
+    vehicles as its uplink carries of the least link, or of the mean rate.
     """
 
     codec: str
     mbps: float
-    low_mbps: float
-    high_mbps: float
+    low_mbps: float | None
+    high_mbps: float | None
     vehicle_cores: float
     server_cores: float
     vehicles_per_cell: int
@@ -148,8 +162,8 @@ class FleetEstimate:
     codec: str
     vehicles: int
     mbps: float
-    low_mbps: float
-    high_mbps: float
+    low_mbps: float | None
+    high_mbps: float | None
     link_mbps: float | None
     server_cores: float
     cells: int | None
@@ -157,13 +171,17 @@ class FleetEstimate:
     @staticmethod
     def of(one: Estimate, vehicles: int) -> FleetEstimate:
         """Return the needs of ``vehicles`` such as ``one``."""
+
+        def total(each: float | None) -> float | None:
+            return None if each is None else vehicles * each
+
         return FleetEstimate(
             one.codec,
             vehicles,
             vehicles * one.mbps,
-            vehicles * one.low_mbps,
-            vehicles * one.high_mbps,
-            None if one.link_mbps is None else vehicles * one.link_mbps,
+            total(one.low_mbps),
+            total(one.high_mbps),
+            total(one.link_mbps),
             vehicles * one.server_cores,
             -(-vehicles // one.vehicles_per_cell) if one.vehicles_per_cell else None,
         )
@@ -177,6 +195,8 @@ class Sizing:
     demand: Demand
     assumptions: Assumptions
     measured_on: str
+    measured_machine: str
+    """The machine that cores and times are of."""
     estimates: Sequence[Estimate]
     beyond: Sequence[str] = field(default=())
     measured_at: str = ""
@@ -201,8 +221,9 @@ def estimate(
         demand,
         assumptions,
         tables.measured_on,
+        tables.machine,
         made,
-        [*_notes(reach), *_late(demand, left_ms), *_roomy_links(made, assumptions)],
+        [*_notes(reach), *_late(demand, left_ms, tables.machine)],
         tables.measured_at,
         [] if demand.delay_ms is None else _reversals(demand, made),
         [FleetEstimate.of(one, demand.vehicles) for one in made],
@@ -221,28 +242,17 @@ def _reversals(demand: Demand, made: Sequence[Estimate]) -> list[str]:
     ]
     if not reversed_by:
         return []
-    links = ", ".join(f"{rival.codec} {rival.link_mbps:.3g}" for rival in reversed_by)
-    own = "no link will do" if ours.link_mbps is None else f"needs {ours.link_mbps:.3g} Mbit/s"
+    names = ", ".join(rival.codec for rival in reversed_by)
+    need = (
+        f"no link will do for {ours.codec}, and one will for {names}"
+        if ours.link_mbps is None
+        else f"{ours.codec} needs a faster link than {names}"
+    )
     return [
-        f"{demand.delay_ms:g} ms reverse the saving: {ours.codec} {own}, against {links} Mbit/s. "
-        "It sends fewer bits, but coding and decoding leave less of the time for the link; allow "
-        "more time, or take the rival"
+        f"{demand.delay_ms:g} ms reverse the saving: {need}. {ours.codec} sends fewer bits, but "
+        "coding and decoding leave less of the time for the link; allow more time, or take the "
+        "rival"
     ]
-
-
-def _roomy_links(made: Sequence[Estimate], assumptions: Assumptions) -> Iterator[str]:
-    """Yield a note that names the codecs whose link is faster than the delay alone needs."""
-    roomy = [
-        f"{one.codec} {one.least_link_mbps:.3g}"
-        for one in made
-        if one.link_mbps and one.least_link_mbps and one.link_mbps > one.least_link_mbps
-    ]
-    if roomy:
-        yield (
-            f"a slower link keeps the delay for the short clips that were measured: "
-            f"{', '.join(roomy)} Mbit/s. Other streets vary more: as planned, the mean rate uses "
-            f"{100 * assumptions.utilisation:g} % of the link (--utilisation)"
-        )
 
 
 def _left_ms(demand: Demand, cells: Sequence[SizingCell], assumptions: Assumptions) -> float | None:
@@ -255,11 +265,11 @@ def _left_ms(demand: Demand, cells: Sequence[SizingCell], assumptions: Assumptio
     return demand.delay_ms - sum(_times_ms(demand.wanted, cells)) - assumptions.propagation_ms
 
 
-def _late(demand: Demand, left_ms: Mapping[str, float | None]) -> list[str]:
+def _late(demand: Demand, left_ms: Mapping[str, float | None], machine: str) -> list[str]:
     """Return a note for each codec that is late on any link; raise ``InvalidInput`` if all are."""
     notes = [
         f"{codec}: no link keeps {demand.delay_ms:g} ms: coding, decoding and propagation alone "
-        f"take {demand.delay_ms - left:.0f} ms on one thread of the machine that was measured"
+        f"take {demand.delay_ms - left:.0f} ms on one thread of {machine}"
         for codec, left in left_ms.items()
         if demand.delay_ms is not None and left is not None and left <= 0
     ]
@@ -296,10 +306,6 @@ def _estimate(
     wanted = demand.wanted
     frame_bytes = math.exp(log_at(cells, wanted, lambda cell: cell.log_bytes(wanted.psnr_db)))
     nearest = nearest_cell(cells, wanted)
-    low, high = (
-        math.exp(nearest.log_bytes(wanted.psnr_db, column) - nearest.log_bytes(wanted.psnr_db))
-        for column in ("low_bytes", "high_bytes")
-    )
     pictures_per_s = demand.cameras * demand.hz
     mbps_of = 8e-6 * pictures_per_s * (1 + assumptions.overhead_percent / 100)
     sender_ms, receiver_ms = _times_ms(wanted, cells)
@@ -310,12 +316,13 @@ def _estimate(
         least_mbps = frames_bps / 1e6 * (1 + assumptions.overhead_percent / 100)
         link_mbps = max(least_mbps, mbps / assumptions.utilisation)
     is_late = left_ms is not None and left_ms <= 0
-    vehicles = 0 if is_late else math.floor(assumptions.cell_mbps / (least_mbps or mbps))
+    vehicles = 0 if is_late else math.floor(assumptions.planned_cell_mbps / (least_mbps or mbps))
+    low_mbps, high_mbps = _interval(nearest, wanted, mbps)
     return Estimate(
         codec=cells[0].codec,
         mbps=mbps,
-        low_mbps=mbps * low,
-        high_mbps=mbps * high,
+        low_mbps=low_mbps,
+        high_mbps=high_mbps,
         vehicle_cores=pictures_per_s * sender_ms / 1e3,
         server_cores=pictures_per_s * receiver_ms / 1e3,
         vehicles_per_cell=vehicles,
@@ -323,6 +330,16 @@ def _estimate(
         link_mbps=link_mbps,
         least_link_mbps=least_mbps,
     )
+
+
+def _interval(
+    nearest: SizingCell, wanted: CameraDemand, mbps: float
+) -> tuple[float, float] | tuple[None, None]:
+    if not is_measured(nearest, wanted):
+        return None, None
+    mean = nearest.log_bytes(wanted.psnr_db)
+    low, high = (nearest.log_bytes(wanted.psnr_db, name) for name in ("low_bytes", "high_bytes"))
+    return mbps * math.exp(low - mean), mbps * math.exp(high - mean)
 
 
 def nearest_cell(cells: Sequence[SizingCell], wanted: CameraDemand) -> SizingCell:

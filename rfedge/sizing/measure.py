@@ -27,8 +27,9 @@ from rfedge.evaluate.rivals import Rival, svtav1_lowdelay, x264_for_psnr, x265_f
 from rfedge.evaluate.runner import clip_key, coded_clip, program_version
 from rfedge.jobs import CellStore
 from rfedge.offline import FrameInput, decode_promised, encode_frames
+from rfedge.results import host
 from rfedge.sizing.estimate import Demand
-from rfedge.sizing.tables import SizingCell, SizingTables, interpolated
+from rfedge.sizing.tables import SAME_RATE, SizingCell, SizingTables, interpolated, machine_name
 
 MIN_FRAMES = 5
 SETTLED_FRAMES = 8
@@ -161,9 +162,6 @@ def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
     return [round(float(value), 1) for value in values]
 
 
-SAME_RATE = 0.02
-
-
 def own_tables(
     dataset: Path, field: Path, demand: Demand, frames: int, cells: Path
 ) -> SizingTables:
@@ -181,4 +179,4 @@ def own_tables(
     name = DriveName(dataset.stem, demand.hz * step, dataset)
     drive = read_sized_drive(name, (demand.width_px, demand.height_px), frames * step)
     measured = measured_cells(drive.every(step), load_field(field), CellStore(cells))
-    return SizingTables(tuple(measured), f"{dataset}; field {field}")
+    return SizingTables(tuple(measured), f"{dataset}; field {field}", machine_name(host()))

@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from rfcore.errors import InvalidInput
 from rfedge.results import read_result, rows_of
@@ -30,6 +31,11 @@ MAX_BEYOND_DB = 1.0
 MARGIN = 1e-6
 KIND = "sizing"
 SHIPPED = Path(__file__).with_name("tables.json")
+SHIPPED_ON = (
+    "one synthetic street, with vehicles that its field has never seen; a field of 640x360 pictures"
+)
+SAME_RATE = 0.02
+"""Rates that differ by less, as ratios, count as one."""
 CODECS = ("rfedge", "x264", "x265", "svtav1")
 """Ours at the default effort; rivals at low delay, tuned for PSNR where that is possible."""
 
@@ -68,10 +74,11 @@ class SizingCell:
 
 @dataclass(frozen=True)
 class SizingTables:
-    """All cells, and the drives that they were measured on, in words."""
+    """All cells, with the drives and the machine that they were measured on, in words."""
 
     cells: tuple[SizingCell, ...]
     measured_on: str
+    machine: str
 
     def of(self, codec: str) -> tuple[SizingCell, ...]:
         """Return the cells of one codec; raise ``InvalidInput`` if there are none."""
@@ -103,12 +110,18 @@ def _listed(rates_hz: Iterable[float]) -> str:
 def read_tables(path: Path) -> SizingTables:
     """Read a result of ``rfedge-lab size-tables``; raise ``InvalidInput`` for another file."""
     result = read_result(path, KIND)
-    return SizingTables(tuple(rows_of(SizingCell, result["cells"])), str(result["measured_on"]))
+    cells = tuple(rows_of(SizingCell, result["cells"]))
+    return SizingTables(cells, str(result["measured_on"]), machine_name(result["host"]))
+
+
+def machine_name(host: Mapping[str, Any]) -> str:
+    """Return the machine of a result (``rfedge.results.host``) in words."""
+    return f"{host['cpu']}, {host['cores']} cores, {host['isa']}"
 
 
 def shipped_tables() -> SizingTables:
     """Return the tables that come with the package."""
-    return read_tables(SHIPPED)
+    return replace(read_tables(SHIPPED), measured_on=SHIPPED_ON)
 
 
 def interpolated(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
@@ -163,7 +176,8 @@ def _over_rate(row: dict[float, float], hz: float) -> float:
 
 
 def check_reach(cells: Sequence[SizingCell], wanted: CameraDemand) -> tuple[str, ...]:
-    """Return a note for each value of ``wanted`` that lies outside the cells of one codec.
+    """Return a note for each value of ``wanted`` that lies outside the cells of one codec, and one
+    for what lies between them.
 
     Raises ``InvalidInput`` naming the value and the range if it lies too far outside.
     """
@@ -175,10 +189,35 @@ def check_reach(cells: Sequence[SizingCell], wanted: CameraDemand) -> tuple[str,
         _beyond("size", f"{size} ({wanted.pixels:,} px)", wanted.pixels, pixels, factor),
         _beyond("hz", f"{wanted.hz:g} Hz", wanted.hz, rates, factor),
         _beyond_db(cells, wanted.psnr_db),
+        _between(cells, wanted),
     ]
     if min(rates) <= wanted.hz <= max(rates):
         notes += _borrowed(cells, wanted)
     return tuple(note for note in notes if note)
+
+
+def is_measured(cell: SizingCell, wanted: CameraDemand) -> bool:
+    """Return whether ``cell`` has the wanted size and rate."""
+    return cell.pixels == wanted.pixels and math.isclose(cell.hz, wanted.hz, rel_tol=SAME_RATE)
+
+
+def _between(cells: Sequence[SizingCell], wanted: CameraDemand) -> str | None:
+    """Return a note that names what the wanted size and rate are interpolated between."""
+    if any(is_measured(cell, wanted) for cell in cells):
+        return None
+    sizes = {cell.pixels: f"{cell.width_px}x{cell.height_px}" for cell in cells}
+    rates = {cell.hz: f"{cell.hz:.3g} Hz" for cell in cells}
+    wanted_px = f"{wanted.width_px}x{wanted.height_px}"
+    parts = []
+    for shown, value, names in (
+        (wanted_px, wanted.pixels, sizes),
+        (f"{wanted.hz:g} Hz", wanted.hz, rates),
+    ):
+        below = max((v for v in names if v <= value * (1 + SAME_RATE)), default=None)
+        above = min((v for v in names if v >= value * (1 - SAME_RATE)), default=None)
+        if below is not None and above is not None and below < above:
+            parts.append(f"{shown} is interpolated between {names[below]} and {names[above]}")
+    return "; ".join(parts) or None
 
 
 def _borrowed(cells: Sequence[SizingCell], wanted: CameraDemand) -> Iterator[str]:

@@ -152,7 +152,7 @@ def test_what_the_field_has_never_seen_costs_what_the_recorded_comparison_says()
 
 def test_one_cell_is_what_rfedge_size_says():
     told = estimate(DEMAND, shipped_tables()).estimates[0]
-    town = city(uplink_mbps=Assumptions().cell_mbps, cores=1000.0, streams=1000)
+    town = city(uplink_mbps=Assumptions().planned_cell_mbps, cores=1000.0, streams=1000)
     costs = costs_of(town, shipped_tables())
     one = city_flow(town, costs, block([1.0]))
     assert one.uplink_bps[0, 0] == pytest.approx(1e6 * told.mbps)

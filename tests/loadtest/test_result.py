@@ -107,6 +107,24 @@ def test_at_80_columns_each_run_is_on_a_line_with_its_number_and_verdict():
     assert "In every row: p50 ms 20.5, p99 ms 130.0" in text
 
 
+def test_the_last_line_says_why_the_smallest_load_was_not_held():
+    runs = [load_run(count, held=count < 8) for count in (4, 8, 16)]
+    row = replace(runs[1].row, refused=3, failed=1, reduced=2)
+    runs[1] = replace(runs[1], row=row)
+    console = Console(file=io.StringIO(), width=80)
+    print_runs(console, LoadResult(runs))
+    *_, last = re.split(r"\n\s*\n", console.file.getvalue().strip())
+    text = " ".join(last.split())
+    assert text.startswith("8 vehicles not held: p99 130 ms above 100 ms")
+    for said in (
+        "3 vehicles refused",
+        "1 vehicle failed",
+        "2 vehicles at a lower rate",
+        "limit of 8",
+    ):
+        assert said in text
+
+
 # --- charts
 
 

@@ -54,7 +54,7 @@ def test_a_good_run_is_held():
         (run_of(vehicle(100, ms=130.0)), "p99 130 ms above 100 ms"),
         (run_of(*[vehicle(100)] * 200, vehicle(40)), "fairness 0.40"),
         (run_of(vehicle(100), growth_mb=9.5), "memory grew 9.5 MB, 9.0 may be"),
-        (replace(run_of(vehicle(100)), wanted_vehicles=3), "2 vehicles were not admitted"),
+        (replace(run_of(vehicle(100)), wanted_vehicles=3), "2 of 3 vehicles were not admitted"),
         (run_of(vehicle(0)), "p99 inf ms"),
     ],
 )

@@ -26,6 +26,7 @@ from rfedge.sizing.estimate import (
 from rfedge.sizing.tables import (
     CODECS,
     MAX_BEYOND_DB,
+    SHIPPED,
     CameraDemand,
     SizingCell,
     SizingTables,
@@ -56,7 +57,9 @@ def cell(codec: str, size_px: tuple[int, int], hz: float) -> SizingCell:
 WHOLE = tuple(cell("rfedge", size_px, hz) for size_px in SIZES for hz in RATES)
 PARTLY = tuple(c for c in WHOLE if c.width_px == 640 or c.hz == 10.0)
 """All rates at one size alone."""
-TABLES = SizingTables((*PARTLY, *(replace(c, codec="x264") for c in PARTLY)), "a power law")
+TABLES = SizingTables(
+    (*PARTLY, *(replace(c, codec="x264") for c in PARTLY)), "a power law", "a machine"
+)
 
 
 @given(
@@ -73,13 +76,15 @@ def test_a_power_law_is_told_everywhere(
     assert told == pytest.approx(math.log(power_law_bytes(wanted.pixels, hz, psnr_db)), abs=1e-6)
 
 
-def test_inside_the_measured_ranges_nothing_is_said() -> None:
-    assert check_reach(WHOLE, CameraDemand(1280, 720, 15.0, 34.0)) == ()
+def test_where_it_was_measured_nothing_is_said() -> None:
+    assert check_reach(WHOLE, CameraDemand(640, 360, 10.0, 34.2)) == ()
 
 
 @pytest.mark.parametrize(
     ("wanted", "said"),
     [
+        (CameraDemand(1280, 720, 10.0, 34.0), "interpolated between 640x360 and 1920x1080"),
+        (CameraDemand(640, 360, 15.0, 34.0), "15 Hz is interpolated between 10 Hz and 30 Hz"),
         (CameraDemand(2560, 1440, 10.0, 34.0), "1.78 times outside"),
         (CameraDemand(640, 360, 60.0, 34.0), "2.00 times outside"),
         (CameraDemand(640, 360, 10.0, 38.5), "38.5 dB is 0.5 dB outside 30..38 dB"),
@@ -163,12 +168,25 @@ def test_cameras_multiply_rate_and_cores_and_divide_vehicles() -> None:
     assert b.mbps == pytest.approx(4 * a.mbps)
     assert b.vehicle_cores == pytest.approx(4 * a.vehicle_cores)
     assert a.vehicle_cores == pytest.approx(10 * 2.304e-3)
-    assert b.vehicles_per_cell == int(four.assumptions.cell_mbps / b.mbps)
+    assert b.vehicles_per_cell == int(four.assumptions.planned_cell_mbps / b.mbps)
+
+
+@pytest.mark.parametrize(
+    ("width_px", "hz", "is_told"), [(640, 10.0, True), (800, 10.0, False), (640, 15.0, False)]
+)
+def test_an_interval_is_told_only_where_it_was_measured(width_px, hz, is_told):
+    """Between cells nobody knows how far the interpolation is off."""
+    sizing = estimate(Demand(1, width_px, width_px * 9 // 16, hz, 34.0, vehicles=3), TABLES)
+    for row in (*sizing.estimates, *sizing.fleet):
+        assert (row.low_mbps is not None) == (row.high_mbps is not None) == is_told
 
 
 def test_a_cell_is_what_the_assumptions_say() -> None:
     dense = Assumptions()
-    assert dense.cell_mbps == pytest.approx(100 * 0.23 * 5.4 * 0.7)
+    assert dense.planned_cell_mbps == pytest.approx(100 * 0.23 * 5.4 * 0.7)
+    assert Assumptions(cell_mbps=50.0).planned_cell_mbps == pytest.approx(50 * 0.7)
+    with pytest.raises(InvalidInput, match="cell-mbps: 0 is outside"):
+        Assumptions(cell_mbps=0.0)
     assert dense.cells_per_km2 == pytest.approx(3 / (math.sqrt(3) / 2 * 0.04))
 
 
@@ -179,7 +197,7 @@ def test_a_delay_that_computing_takes_alone_is_refused() -> None:
 
 def test_who_is_late_on_any_link_is_named_and_no_cell_holds_it() -> None:
     quick = tuple(replace(c, codec="x264", sender_ms=1.0, receiver_ms=1.0) for c in PARTLY)
-    mixed = SizingTables((*PARTLY, *quick), "a power law")
+    mixed = SizingTables((*PARTLY, *quick), "a power law", "a machine")
     sizing = estimate(Demand(1, 1920, 1080, 10.0, 34.0, delay_ms=50.0), mixed)
     ours, theirs = sizing.estimates
     assert (ours.link_mbps, ours.vehicles_per_cell) == (None, 0)
@@ -234,7 +252,7 @@ def slower(ms: float) -> SizingTables:
         )
         for c in PARTLY
     ]
-    return SizingTables((*halved, *theirs), "a power law")
+    return SizingTables((*halved, *theirs), "a power law", "a machine")
 
 
 @pytest.mark.parametrize(("ms", "is_reversed"), [(1.0, False), (39.0, False), (41.0, True)])
@@ -263,8 +281,7 @@ def test_a_planned_link_is_used_to_a_share_and_carries_the_delay(delay_ms, is_lo
     for one in sizing.estimates:
         assert (one.least_link_mbps == pytest.approx(one.mbps, rel=0.01)) == is_long
         assert one.link_mbps == pytest.approx(max(one.least_link_mbps, one.mbps / share))
-        assert one.vehicles_per_cell == math.floor(assumed.cell_mbps / one.least_link_mbps)
-    assert any("a slower link keeps the delay" in note for note in sizing.beyond) == is_long
+        assert one.vehicles_per_cell == math.floor(assumed.planned_cell_mbps / one.least_link_mbps)
 
 
 @pytest.mark.parametrize(
@@ -281,6 +298,22 @@ def test_a_plot_for_a_report_names_its_conditions(tmp_path, suffix, magic, capsy
         assert all(name in drawn for name in (*CODECS, *conditions))
         assert max(map(len, re.findall(r">([^<]+)</text>", drawn))) <= COLUMNS
     assert "All 12 vehicles" in capsys.readouterr().out, "a file does not silence the table"
+
+
+def test_a_plot_says_where_no_link_will_do_and_all_that_is_noted(tmp_path, capsys):
+    """Of a fleet, every figure in it is the fleet's: none is a single vehicle's."""
+    plot = tmp_path / "uplink.svg"
+    asked = "--vehicles 12 --cameras 4 --size 1280x720 --hz 15 --delay-ms 100"
+    parse(["size", *asked.split(), "--plot", str(plot)]).run()
+    drawn = re.findall(r">([^<]+)</text>", plot.read_text())
+    assert [text.strip() for text in drawn].count("no link keeps 100 ms") == 1
+    assert "uplink of all 12 vehicles, Mbit/s with transport" in drawn
+    small_print = " ".join(drawn)
+    for note in ("between 640x360 and 1920x1080", "synthetic street", "effect of 15 Hz", "reverse"):
+        assert note in small_print
+    assert small_print.count("Mbit/s") == 1
+    row = re.search(r"rfedge .*", capsys.readouterr().out)
+    assert "none" in row[0]
 
 
 def test_a_plot_of_another_kind_is_refused(tmp_path):
@@ -318,6 +351,8 @@ def test_the_answer_as_json_reads_back(tmp_path: Path) -> None:
     sizing = json.loads((tmp_path / "size.json").read_text())["sizing"]
     assert [row["codec"] for row in sizing["estimates"]] == list(CODECS)
     assert sizing["demand"]["psnr_db"] == 34.0
+    host = json.loads(SHIPPED.read_text())["host"]
+    assert sizing["measured_machine"] == f"{host['cpu']}, {host['cores']} cores, {host['isa']}"
 
 
 def test_half_of_an_own_drive_is_refused() -> None:
