@@ -32,7 +32,7 @@ async def drive(config: AgentConfig) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, vehicle.stop)
     counts = await vehicle.run()
-    structlog.get_logger().info("drive ended", **counts)
+    structlog.get_logger().info("drive ended", **counts, **vehicle.quality)
     if not counts["acked"]:
         raise RfedgeError(vehicle.explanation)
 

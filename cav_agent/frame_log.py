@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from math import log10
 from statistics import median
 from typing import Any, TextIO
 
@@ -129,10 +130,12 @@ class DriveObserver:
         self._logged_crf: float | None = None
         self._pose_state: LocalisationState | None = None
         self._feed_offset_s: float | None = None
+        self._luma_mse_sum, self._measured = 0.0, 0
 
     def ended(self, result: FrameResult) -> None:
         """A captured picture came to its end."""
         self._metrics.ended(result)
+        self._take_quality(result)
         if result.outcome is not Outcome.ACKED:
             self._unacknowledged[str(result.outcome), str(result.reason)] += 1
             self._problem = result.problem or self._problem
@@ -143,6 +146,18 @@ class DriveObserver:
         self._log_quality(result)
         if self._delay_watch is not None:
             self._delay_watch.acked(result)
+
+    def quality(self) -> dict[str, float]:
+        """Return the luma PSNR of the mean squared error of all acknowledged pictures, if any."""
+        if not self._luma_mse_sum:
+            return {}
+        return {"psnr_db": _psnr_db(self._luma_mse_sum / self._measured)}
+
+    def _take_quality(self, result: FrameResult) -> None:
+        encoded = result.encoded
+        if result.outcome is Outcome.ACKED and encoded and encoded.luma_mse is not None:
+            self._luma_mse_sum += encoded.luma_mse
+            self._measured += 1
 
     def explanation(self) -> str:
         """Return why no picture of a drive was acknowledged, and what to do."""
@@ -323,6 +338,7 @@ def _coding_of(result: FrameResult) -> dict[str, Any]:
         "tries": encoded.tries if encoded else None,
         "rung": encoded.rung.name if encoded else None,
         "crf": encoded.crf if encoded else None,
+        "psnr_db": _psnr_db(encoded.luma_mse) if encoded and encoded.luma_mse else None,
         "relit": packet.relit if packet else None,
         "light_field": encoded.field_id or None if encoded else None,
         "pose": _pose_of(encoded.fix) if encoded and encoded.fix else None,
@@ -331,6 +347,10 @@ def _coding_of(result: FrameResult) -> dict[str, Any]:
         "render_digest": packet.render_digest.hex() if packet else None,
         "reconstruction_digest": packet.reconstruction_digest.hex() if packet else None,
     }
+
+
+def _psnr_db(luma_mse: float) -> float:
+    return round(10 * log10(255**2 / luma_mse), 2)
 
 
 def _pose_of(fix: PoseEstimate) -> dict[str, Any]:

@@ -84,6 +84,8 @@ class EncodedFrame:
     """Seconds from the arrival of a live camera's picture until it was taken to be coded."""
     field_id: str = ""
     """The field it was coded against; empty: Hello's first."""
+    luma_mse: float | None = None
+    """Mean squared error of the luma that the server will show."""
 
     @property
     def sender_s(self) -> float:

@@ -27,6 +27,7 @@ from rfcore.codec.sender.rate import RateModel, RateTarget
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, Renderer, render_field_view
 from rfcore.image import I420, Rgb
+from rfcore.metrics import mean_squared_error
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
 from rfcore.wire.messages import FrameAddress, PoseAhead
@@ -144,6 +145,7 @@ class Pipeline:
             read_s=read_s,
             waited_s=waited_s,
             field_id=field_id,
+            luma_mse=mean_squared_error(encoded.reconstruction.y, frame.y),
         )
         self._rungs.coded(
             made.sender_s,

@@ -127,6 +127,11 @@ class Vehicle:
         assert self._observer is not None
         return self._observer.explanation()
 
+    @property
+    def quality(self) -> dict[str, float]:
+        """The luma PSNR of all acknowledged pictures, ``psnr_db``; empty without one."""
+        return {} if self._observer is None else self._observer.quality()
+
     def stop(self) -> None:
         """Finish the frame in flight, then end."""
         self._stopped.set()

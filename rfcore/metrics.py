@@ -23,6 +23,8 @@ from rfcore.errors import InvalidInput
 Picture = NDArray[Any]
 Mask = NDArray[np.bool_]
 UINT8_PEAK = 255.0
+INT32_SQUARES = (2**31 - 1) // 255**2
+"""Number of squared differences of uint8 of which the sum fits into an int32."""
 RADIUS_PX = 5
 SIGMA_PX = 1.5
 K1, K2 = 0.01, 0.03
@@ -60,8 +62,10 @@ def mean_squared_error(a: Picture, b: Picture) -> float:
     """Return the mean of (a - b)^2 over every pixel and channel: in float64, exact for uint8."""
     _check_comparable(a, b)
     if a.dtype == np.uint8:
-        steps = np.subtract(a, b, dtype=np.int32).ravel()
-        return int(np.einsum("i,i->", steps, steps, dtype=np.int64)) / steps.size
+        steps = np.subtract(a, b, dtype=np.int16).reshape(len(a), -1)
+        row_type = np.int32 if steps.shape[1] <= INT32_SQUARES else np.int64
+        rows = np.einsum("ij,ij->i", steps, steps, dtype=row_type)
+        return int(rows.sum(dtype=np.int64)) / steps.size
     difference = a.astype(np.float64) - b.astype(np.float64)
     return float(np.mean(difference * difference))
 

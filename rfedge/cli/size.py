@@ -234,7 +234,7 @@ def write_sizing_plot(sizing: Sizing, path: Path) -> None:
             is_late = demand.delay_ms is not None and row.link_mbps is None
             label, alpha = "" if place else "mean rate", 0.35 if is_late else 1.0
             axes.barh(place, row.mbps, 0.5, color=BLUE, alpha=alpha, label=label)
-            if row.low_mbps is not None:
+            if row.low_mbps is not None and row.high_mbps is not None:
                 ends = (row.low_mbps, row.high_mbps)
                 axes.plot(ends, (place, place), color=INK, label="" if place else "95 %")
             if is_late:

@@ -205,7 +205,7 @@ def _between(cells: Sequence[SizingCell], wanted: CameraDemand) -> str | None:
     """Return a note that names what the wanted size and rate are interpolated between."""
     if any(is_measured(cell, wanted) for cell in cells):
         return None
-    sizes = {cell.pixels: f"{cell.width_px}x{cell.height_px}" for cell in cells}
+    sizes: dict[float, str] = {c.pixels: f"{c.width_px}x{c.height_px}" for c in cells}
     rates = {cell.hz: f"{cell.hz:.3g} Hz" for cell in cells}
     wanted_px = f"{wanted.width_px}x{wanted.height_px}"
     parts = []

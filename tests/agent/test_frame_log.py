@@ -76,6 +76,20 @@ def acked(
     )
 
 
+def test_the_quality_of_a_drive_is_that_of_the_mean_error_of_what_was_shown(metrics, acked):
+    """Half of 100 and of 300 is 200: 25.12 dB."""
+    observer = DriveObserver(metrics, ADDRESSES)
+    assert observer.quality() == {}
+    for mse in (100.0, 300.0):
+        shown = replace(acked, encoded=replace(acked.encoded, luma_mse=mse))
+        observer.ended(shown)
+        observer.ended(replace(shown, outcome=Outcome.LOST))
+    observer.ended(replace(acked, outcome=Outcome.LOST))
+    assert observer.quality() == {"psnr_db": 25.12}
+    assert log_line(shown)["psnr_db"] == 23.36
+    assert log_line(acked)["psnr_db"] is None
+
+
 # --- the delay that processors take
 
 

@@ -21,6 +21,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import Quality, render_field_view
 from rfcore.image import I420, Rgb
 from rfcore.localise.estimate import LocalisationState
+from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, View
 from rfcore.wire.messages import FrameAddress, PoseAhead
 
@@ -53,6 +54,17 @@ def test_a_noise_picture_is_coded_until_its_slice_is_below_the_limit(noisy: Capt
     assert free.tries == 1
     assert len(free.packet.payload) > LIMIT_BYTES >= len(made.packet.payload)
     assert made.tries > 1
+
+
+def test_the_error_is_that_of_the_picture_that_the_server_decodes(noisy: Capture) -> None:
+    pipeline = Pipeline(Grey(), CodecConfig(32, 16, effort="fast", crf=30), lambda: 0)
+    made = pipeline.encode(EncodeJob(noisy, 0, 1))
+    view = render_field_view(Grey(), noisy.picture.camera.rounded(), made.rung.quality)
+    decoder = DeltaDecoder(pipeline.header)
+    shown = decoder.decode(decoder.start(), made.packet, view).frame
+    difference = shown.y.astype(float) - i420_from_rgb(noisy.picture.read()).y
+    assert made.luma_mse == pytest.approx(np.mean(difference**2))
+    assert made.luma_mse > 1
 
 
 def test_block_means_are_sent_only_where_the_server_is_not_exact(noisy: Capture) -> None:
