@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from statistics import fmean, median
 from typing import Any
 
@@ -46,7 +46,6 @@ from rfedge.evaluate.clips import Drive, luma_mse, psnr_of_mse, read_drive
 from rfedge.evaluate.field_coder import RenderedClip, render_clip
 from rfedge.evaluate.lossy_link import EvalLossyLink
 from rfedge.evaluate.runner import Run, program_version
-from rfedge.loadtest.server import KeptRenders
 from rfedge.report.tables import Column, Table
 from rfedge.results import Result, rows_of
 
@@ -60,6 +59,8 @@ FRAMING_BYTES = 14
 REOPEN_RTTS = 3
 """Handshake, Hello and Welcome of a stream that is opened again."""
 QUICK_S = 8.0
+MAX_KEPT = 64
+"""Renders of 640x360 are 4.6 MB each."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,13 @@ class LossyLinkRow:
     streams_lost: int = 0
     seed: int | None = None
     """Seed of the losses; None: a result of one seed, which its ``link`` names."""
+
+
+class _KeptRenders:
+    """A field that keeps its last renders: a drive is played forth and back."""
+
+    def __init__(self, renderer: Renderer) -> None:
+        self.render = lru_cache(MAX_KEPT)(renderer.render)
 
 
 def _spread(heading: str, name: str, form: str) -> Column:
@@ -145,7 +153,7 @@ def run_lossy_link(job: EvalLossyLink, console: Console) -> dict[str, Any]:
     renderer = load_field(job.field)
     drive = read_drive(job.drive, None, (renderer, job.field))
     kept = [replace(picture, read=cache(picture.read)) for picture in drive.pictures]
-    drive, renders = replace(drive, pictures=kept), KeptRenders(renderer)
+    drive, renders = replace(drive, pictures=kept), _KeptRenders(renderer)
     rendered = render_clip(renderer, drive.cameras)
     seconds = QUICK_S if job.quick else job.seconds
     rows: list[LossyLinkRow] = []
