@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 from unittest import mock
 
 import lab.cli
@@ -280,7 +280,8 @@ def results_page() -> str:
         "A result is one JSON object: `kind`, `command`, `revision`, `dirty`, `host` and `inputs` "
         "say how it was made (`rfedge.results`), the rest is the measurement, in lists of rows. A "
         "column that is not known is left out of its row. Units are in the names; `scene` is the "
-        "drive, `hz` its frames a second, `method` what coded it, `point` its CRF. "
+        "drive, `hz` its frames a second, `method` what coded it, `point` its CRF, "
+        "`rival_` before a name the same of the rival. "
         "`rfedge.results.rows_of(type, result[key])` reads them back.\n",
     ]
     for place, name in ROWS.items():
@@ -295,8 +296,9 @@ def results_page() -> str:
     return "\n".join(parts)
 
 
-def _columns(row: type[Any]) -> Iterator[Sequence[str]]:
-    """Yield each column of a row with what its docstring, or its heading in tables, says."""
+def _columns(row: type[Any], above: str = "") -> Iterator[Sequence[str]]:
+    """Yield each column of a row with what its docstring, or its heading in tables, says; behind
+    one that holds rows itself, their columns."""
     texts = {}
     for made in reversed(row.__mro__[:-1]):
         (body,) = ast.parse(inspect.cleandoc(inspect.getsource(made))).body
@@ -305,11 +307,15 @@ def _columns(row: type[Any]) -> Iterator[Sequence[str]]:
             if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
                 documented = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
                 texts[line.target.id] = str(after.value.value) if documented else ""
+    types = get_type_hints(row)
     for each in dataclasses.fields(row):
         heading = each.metadata.get(SHOWN, ("",))[0]
         text = texts.get(each.name) or heading
         kind = str(each.type).replace("Sequence", "list").replace("Mapping", "object")
-        yield code(each.name), code(kind), escaped(re.sub(r"\s+", " ", text.replace("``", "")))
+        text = escaped(re.sub(r"\s+", " ", text.replace("``", "")))
+        yield code(above + each.name), code(kind), text
+        for inner in filter(dataclasses.is_dataclass, get_args(types[each.name])):
+            yield from _columns(inner, f"{above}{each.name}[].")
 
 
 def api_page() -> str:

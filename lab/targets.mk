@@ -6,8 +6,9 @@
 results results-full: build-full  ## record anew what takes two hours, or everything (DATA)
 	$(MAKE) -f lab/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
 
-results-%: build-full  ## record `rfedge-lab NAME` in lab/results/NAME.json (ARGS)
-	$(BIN)/rfedge-lab $* $(ARGS) --out lab/results/$*.json
+EVAL := compare never-worse ladder lossy-link
+results-%: build-full  ## record `rfedge eval NAME` or `rfedge-lab NAME` in lab/results/NAME.json (ARGS)
+	$(BIN)/rfedge$(if $(filter $*,$(EVAL)), eval,-lab) $* $(ARGS) --out lab/results/$*.json
 
 figures: build-full  ## make the pages and figures of the recorded results
 	$(BIN)/python -m lab.pages

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,11 +35,34 @@ def make_named(option: str, text: str) -> object:
         raise InvalidInput(option, f"{text!r}: {module_name} ({where}) has no {class_name!r}")
     try:
         instance: object = made()
-    except (TypeError, ValueError, AttributeError) as error:
-        raise InvalidInput(
-            option, f"{text!r} cannot be called without arguments: {error}"
-        ) from error
+    except Exception as error:
+        why = f"cannot be called without arguments: {error_in_a_line(error, text)}"
+        raise InvalidInput(option, f"{text!r} {why}") from error
     return instance
+
+
+def module_file(text: str) -> Path | None:
+    """Return the file of the module of ``package.module:Class``, which was made; None without one.
+
+    It is relative to the working folder if it is below that.
+    """
+    name = getattr(sys.modules.get(text.partition(":")[0]), "__file__", None)
+    if name is None:
+        return None
+    here, path = Path.cwd(), Path(name)
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def error_in_a_line(error: Exception, text: str) -> str:
+    """Return class, message and place of an error; the place is where ``text``'s module was last.
+
+    A class of a user fails in the user's own way: the line tells where to look.
+    """
+    said = " ".join(f"{type(error).__name__}: {error}".split())
+    stack = traceback.extract_tb(error.__traceback__)
+    file = getattr(sys.modules.get(text.partition(":")[0]), "__file__", None)
+    own = [frame for frame in stack if frame.filename == file] or stack
+    return f"{said} ({own[-1].filename}:{own[-1].lineno})" if own else said
 
 
 def _imported(option: str, text: str, module_name: str) -> ModuleType:
@@ -51,8 +75,9 @@ def _imported(option: str, text: str, module_name: str) -> ModuleType:
             why = f"there is neither {Path.cwd() / file} nor an installed module {module_name!r}"
             raise InvalidInput(option, f"{text!r}: {why}") from error
         raise InvalidInput(option, f"{text!r}: {module_name} needs {error.name!r}") from error
-    except (ImportError, ValueError, TypeError) as error:
-        raise InvalidInput(option, f"{text!r} cannot be imported: {error}") from error
+    except Exception as error:
+        why = f"cannot be imported: {error_in_a_line(error, text)}"
+        raise InvalidInput(option, f"{text!r} {why}") from error
 
 
 @contextmanager

@@ -76,7 +76,31 @@ def parse_options(
     with them, and raises ``SystemExit``.
     """
     _wrap_help_as_paragraphs()
-    return tyro.cli(kind, prog=name, description=description, args=arguments, config=CONFIG)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    words = _up_to_unknown_verb(kind, words)
+    return tyro.cli(kind, prog=name, description=description, args=words, config=CONFIG)
+
+
+def _up_to_unknown_verb(kind: Any, words: list[str]) -> list[str]:
+    """Return the words up to a verb that there is not, so that a ``--help`` behind it is not
+    answered with the help of what stands before."""
+    for number, word in enumerate(words, 1):
+        verbs = verbs_of(kind)
+        if not verbs or word.startswith("-"):
+            break
+        if word not in verbs:
+            return words[:number]
+        kind = verbs[word]
+    return words
+
+
+def verbs_of(kind: Any) -> dict[str, Any]:
+    """Return what can stand next: the verbs of a union, or of the union that is a class's field."""
+    if is_dataclass(kind):
+        hints = map(get_args, get_type_hints(kind, include_extras=True).values())
+        return next(filter(None, (verbs_of(hint[0]) for hint in hints if hint)), {})
+    pairs = [get_args(each) for each in get_args(kind)]
+    return {pair[1].name: pair[0] for pair in pairs if len(pair) == 2 and is_dataclass(pair[0])}
 
 
 def option_names(kind: Any) -> list[str]:

@@ -25,6 +25,7 @@ class NeededRow:
     hz: float
     method: str
     crf: float
+    """The CRF that gives ``psnr_db``."""
     psnr_db: float = field(metadata=shown("dB", ".2f"))
     kbit_per_frame: float = field(metadata=shown("kbit a frame", ".1f"))
     """Mean over all frames but the first."""
@@ -45,9 +46,12 @@ class PlayedRow:
     method: str
     crf: float
     psnr_db: float
+    """Luma PSNR of the drive, the same for both methods."""
     link: str = field(metadata=shown("link"))
     rate_bps: float
+    """Mean rate of the link."""
     frames: int
+    """Frames played, the clip again and again."""
     dropped: int
     """Frames that were not sent because two were still under way."""
     tau_ms: Mapping[str, float]
@@ -72,11 +76,14 @@ class ShownRow:
     method: str
     crf: float
     psnr_db: float
+    """Luma PSNR of the drive, the same for both methods."""
     width_px: int
     height_px: int
     link: str = field(metadata=shown("link"))
     rate_bps: float
+    """Mean rate of the link."""
     frames: int
+    """Frames played, the clip again and again."""
     dropped: int
     """Frames that a newer one overtook before they were coded."""
     sent_ms: Mapping[str, float]
@@ -89,6 +96,7 @@ class ShownRow:
     sender_busy_percent: float
     """Share of the time that one core of the vehicle computes."""
     receiver_busy_percent: float
+    """Share of the time that one core of the server computes."""
     pose_ahead: bool = False
     """Poses were sent ahead of their frames."""
 

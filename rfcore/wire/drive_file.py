@@ -48,6 +48,14 @@ def write_drive(path: Path, drive: CodedDrive) -> None:
             serialize_length_prefixed(request, cast("BytesIO", file))
 
 
+def is_coded_drive(path: Path) -> bool:
+    """Return whether a file begins as a coded drive."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
 def read_drive(path: Path) -> CodedDrive:
     """Read and check a coded drive, as ``rfedge encode`` writes it.
 

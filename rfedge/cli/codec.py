@@ -211,11 +211,15 @@ class Decode:
         """Decode every frame; stop at the first packet that fails a check."""
         from mec_server.config import DecoderKind
         from mec_server.decoding.decoders import Decoders
+        from rfcore.errors import InvalidInput
         from rfcore.extras import require
         from rfcore.raster.renderers import renderer_isa
         from rfcore.wire.drive_file import read_drive
         from rfedge.offline import decode_drive
 
+        if not self.coded.exists():
+            made = f"rfedge encode DRIVE --field {self.field} --out {self.coded}"
+            raise InvalidInput("coded", f"there is no {self.coded}; {made} makes it")
         film, mcap = (self.out.suffix.lower() == suffix for suffix in (".mp4", ".mcap"))
         if mcap:
             require("bags", "mcap", "foxglove_schemas_protobuf")

@@ -25,19 +25,23 @@ class Doctor:
     """
 
     path: Annotated[Path, Positional, arg(metavar="FILE|FOLDER")]
-    """Splats of any program, a field, a dataset, an MCAP file or ROS 2 bag, pictures, a video."""
+    """Splats of any program, a field, a coded drive (.rfv), a dataset, an MCAP file or ROS 2 bag,
+    pictures, a video."""
 
     def run(self) -> None:
         """Print a line for each thing."""
         from rfcore.dataset.bag_file import is_bag
         from rfcore.errors import DatasetError, InvalidInput
         from rfcore.field.splat_file import looks_like_splats
+        from rfcore.wire.drive_file import is_coded_drive
 
         if not self.path.exists():
             raise InvalidInput("path", f"there is no {self.path}")
         try:
             if is_field_file(self.path):
                 lines = _of_field(self.path)
+            elif is_coded_drive(self.path):
+                lines = _of_coded_drive(self.path)
             elif looks_like_splats(self.path):
                 lines = _of_splats(self.path)
             elif is_bag(self.path):
@@ -67,6 +71,16 @@ def _of_field(path: Path) -> Iterator[str]:
     for name, value in describe_field(open_field(path)):
         yield f"{name:>13}  {value}"
     yield f"next: rfedge field info {shlex.quote(str(path))} --drive DATASET"
+
+
+def _of_coded_drive(path: Path) -> Iterator[str]:
+    from rfcore.wire.drive_file import read_drive
+
+    drive = read_drive(path)
+    k, field = drive.hello.cameras[0].intrinsics, drive.hello.field_ids[0]
+    size = f"{len(drive.frames)} frames of {k.width_px}x{k.height_px} px"
+    yield f"{path}: a coded drive of {size}, against the field {field[:12]}"
+    yield f"next: rfedge decode {shlex.quote(str(path))} --field FIELD.rff --out FOLDER"
 
 
 def _of_splats(path: Path) -> Iterator[str]:

@@ -36,7 +36,7 @@ class Experiment:
     cells: Path
     """Folder of finished pieces."""
     quick: bool = False
-    """Code only a few frames, to see that it works; the figures mean nothing."""
+    """Code only a few frames: shows that it works and about where figures lie, not for a report."""
 
     def __post_init__(self) -> None:
         check_result_path(self.out)

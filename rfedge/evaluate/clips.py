@@ -42,7 +42,9 @@ class CodedClip:
 
     ``frame_bytes`` int64 [N], all that would have to be sent for the frame; ``luma_mse`` float64
     [N], of the decoded luma against the camera's on the true size; ``ssim`` float64 [N], likewise;
-    ``cpu_ms`` float64, processor time of the sender over the whole clip, of all its threads.
+    ``cpu_ms`` and ``receiver_cpu_ms``, processor time over the whole clip, of all threads, of the
+    sender (what it does before a frame is sent) and of the receiver (until a picture is there).
+    Their sum is what tables call the time of both ends.
     """
 
     point: float
@@ -53,7 +55,8 @@ class CodedClip:
     notes: Mapping[str, Notes] = field(default_factory=dict)
     """Notes of the method on each frame, by name: references chosen, bits by kind..."""
     receiver_cpu_ms: float | None = None
-    """Processor time of the receiver over the whole clip; None if the method does not tell."""
+    """None: not measured, and the time of both ends is the sender's alone. A codec of ``--method``
+    has to give it."""
 
     def __post_init__(self) -> None:
         shapes = {self.frame_bytes.shape, self.luma_mse.shape, self.ssim.shape}
@@ -87,7 +90,8 @@ class ClipCoder(Protocol):
 
     ``name`` labels it in tables. ``points`` are its operating points (CRF, QP or whatever it
     takes), ordered from best to worst quality, and must span the quality window asked about.
-    ``version`` names the program behind it: finished pieces of another version are done anew.
+    ``version`` names the program behind it: finished pieces of another version are done anew, as
+    are those of a ``--method`` whose module's file was edited.
     """
 
     @property

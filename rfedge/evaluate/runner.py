@@ -56,10 +56,12 @@ class Run:
             run_jobs(jobs, partial(print, flush=True), ray, processes)
 
     def finish(self, content: Mapping[str, Any], parts: Parts) -> dict[str, Any]:
-        """Write the result, print the tables among its ``parts``, and return the result."""
+        """Write the result, print its ``parts`` and where it is, and return it."""
         result = make_result(self.kind, self.made, {"quick": self.job.quick, **content})
         write_result(self.job.out, result)
         print_tables(map(self._labelled, parts(result)), self.console)
+        told = f"written to {self.job.out}"
+        self.console.print(told, markup=False, highlight=False, soft_wrap=True)
         return result
 
     def _labelled(self, part: Table | str) -> Table | str:

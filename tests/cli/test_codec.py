@@ -58,6 +58,21 @@ def test_encode_says_rate_and_quality_and_decode_finds_the_same_quality(here, ca
 
 
 @pytest.mark.usefixtures("here")
+def test_a_drive_that_is_not_there_is_named_with_the_command_that_makes_it(capsys):
+    decode = ["decode", "a.rfv", "--field", "street.rff", "--out", "p"]
+    with pytest.raises(InvalidInput, match=r"there is no a\.rfv") as caught:
+        parse(decode).run()
+    words = re.search("rfedge (encode .*) makes it", str(caught.value))[1].split()
+    parse([DRIVE if word == "DRIVE" else word for word in words]).run()
+    parse(["doctor", "a.rfv"]).run()
+    said = capsys.readouterr().out
+    assert "a.rfv: a coded drive of 4 frames of " in said
+    words = re.search(r"^next: rfedge (.*)$", said, re.MULTILINE)[1].split()
+    parse([{"FIELD.rff": "street.rff", "FOLDER": "p"}.get(word, word) for word in words]).run()
+    assert len(list(Path("p").iterdir())) == 4
+
+
+@pytest.mark.usefixtures("here")
 def test_a_rate_is_stated_or_taken_from_times_and_said_where_it_is_assumed(capsys):
     content = json.loads(Path(DRIVE).read_text())
     untimed = [{k: v for k, v in frame.items() if k != "time"} for frame in content["frames"]]

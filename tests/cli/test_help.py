@@ -135,6 +135,13 @@ def test_the_help_of_an_option_is_one_paragraph(monkeypatch):
     assert "KITTI, ...). Of a folder that `rfedge dataset split` made" in done.stdout
 
 
+@pytest.mark.parametrize("words", ["nonsense --help", "eval paper -h", "field nonsense --help"])
+def test_help_of_a_verb_that_there_is_not_is_an_error(words):
+    done = rfedge(*words.split())
+    assert done.returncode == 2
+    assert words.split()[-2] in done.stderr
+
+
 def test_the_version_is_that_of_the_distribution():
     done = in_a_process("--version")
     assert (done.returncode, done.stdout) == (0, f"rfedge {version('rfedge')}\n")

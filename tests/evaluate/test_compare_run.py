@@ -19,10 +19,15 @@ from rfcore.field import load_field
 from rfedge.evaluate import runner
 from rfedge.evaluate.clips import DriveName, read_drive
 from rfedge.evaluate.compare import EvalCompare, measure, run
-from rfedge.evaluate.compare.drives import foreign_coder, jobs_of_drives, read_drive_comparisons
+from rfedge.evaluate.compare.drives import (
+    asked_families,
+    jobs_of_drives,
+    read_drive_comparisons,
+)
 from rfedge.evaluate.compare.measure import BEST, BEST_OF_ANY_CPU
 from rfedge.evaluate.compare.rows import compare_parts
 from rfedge.evaluate.compare.run import run_compare
+from rfedge.evaluate.own_coder import own_coder
 from rfedge.jobs import run_jobs
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -68,7 +73,7 @@ def test_another_form_is_refused_by_an_example(text):
 )
 def test_a_method_that_is_none_is_refused_with_what_was_looked_for(text, why):
     with pytest.raises(InvalidInput, match=f"method: .*{why}"):
-        foreign_coder(text)
+        own_coder(text)
 
 
 MJPEG = """
@@ -91,26 +96,62 @@ def working_folder(tmp_path, monkeypatch):
 def test_a_method_is_found_in_the_working_folder(working_folder):
     (working_folder / "mjpeg_rival_here.py").write_text(MJPEG)
     before = list(sys.path)
-    assert foreign_coder("mjpeg_rival_here:MotionJpeg").name == "mjpeg"
+    assert own_coder("mjpeg_rival_here:MotionJpeg").name == "mjpeg"
     assert sys.path == before
 
 
 def test_a_method_is_found_in_a_package_of_the_working_folder(working_folder):
     (working_folder / "rivals_here").mkdir()
     (working_folder / "rivals_here/mjpeg.py").write_text(MJPEG)
-    assert foreign_coder("rivals_here.mjpeg:MotionJpeg").points == (2.0, 8.0)
+    assert own_coder("rivals_here.mjpeg:MotionJpeg").points == (2.0, 8.0)
 
 
 def test_a_module_that_lacks_something_itself_is_told_from_one_that_is_not_there(working_folder):
     (working_folder / "broken_rival.py").write_text("import not_installed_here")
     with pytest.raises(InvalidInput, match="broken_rival needs 'not_installed_here'"):
-        foreign_coder("broken_rival:X")
+        own_coder("broken_rival:X")
 
 
 @pytest.mark.parametrize("window", [(35.0, 32.0), (32.0, 32.0), (0.0, 30.0), (30.0, math.inf)])
 def test_a_window_that_does_not_rise_is_refused(window):
     with pytest.raises(InvalidInput, match="window"):
         EvalCompare(field=Path("f.rff"), drives=("a@1=b",), window=window)
+
+
+X264_HERE = """
+import rfedge.evaluate.rivals as rivals
+
+class Mine:
+    name, version = "mine", "1"
+
+    def __init__(self):
+        self.points = rivals.X264_CRFS
+
+    def code(self, frames, rate_hz, point):
+        return rivals.x264_with_our_tools("ultrafast").code(frames, rate_hz, point)
+"""
+
+
+def test_a_codec_of_ones_own_is_a_method_against_x264_and_its_file_an_input(
+    thumbnail, tmp_path, working_folder
+):
+    (working_folder / "mjpeg_rival_here.py").write_text(X264_HERE)
+    anchor = "x264-our-tools-ultrafast"
+    job = job_of(
+        thumbnail,
+        tmp_path,
+        method=("mjpeg_rival_here:Mine",),
+        rivals=(anchor,),
+        window=(33.0, 36.0),
+    )
+    result = run_compare(job, Console(quiet=True))
+    own = {row["rival"]: row for row in result["rows"] if row["method"] == "mine"}
+    assert abs(own[anchor]["bd_rate_percent"]) < 1, "x264 at other points, against itself"
+    assert own.keys() == {anchor, "x264-lowdelay-psnr", BEST, BEST_OF_ANY_CPU} & own.keys()
+    *_, told = compare_parts(result)
+    assert told.startswith("wall, 10 Hz: mine takes")
+    files = {str(thumbnail.field), thumbnail.drive.partition("=")[2], "mjpeg_rival_here.py"}
+    assert result["inputs"].keys() == files
 
 
 def job_of(thumbnail, folder, **change):
@@ -379,6 +420,21 @@ def test_rivals_that_are_asked_for_stand_alone_with_the_one_a_field_is_paid_for_
     }
     assert {row["rival"] for row in result["break_even"]} == {"x264-lowdelay-psnr-ultrafast"}
     assert result["ssim"] == []
+
+
+def test_a_rival_is_named_by_its_family_or_as_tables_print_it():
+    asked = asked_families(
+        EvalCompare(
+            field=Path("f.rff"),
+            drives=("a@1=b",),
+            rivals=("svtav1-lowdelay-p4", "x265-medium"),
+        )
+    )
+    assert {family: [coder.name for coder in those] for family, those in asked.items()} == {
+        "x264-lowdelay-psnr": ["x264-lowdelay-psnr-veryfast"],
+        "x265-medium": ["x265-lowdelay-psnr-medium"],
+        "svtav1-lowdelay": ["svtav1-lowdelay-p4"],
+    }
 
 
 def test_a_rival_that_nobody_knows_is_refused_with_those_there_are(thumbnail, tmp_path):

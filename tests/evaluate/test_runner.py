@@ -177,4 +177,4 @@ def test_a_run_writes_its_result_and_prints_the_tables_of_it(tmp_path):
     assert (result["kind"], result["quick"], result["rows"]) == ("test", True, [1, 2])
     assert said.getvalue().startswith("[bold]half done\n")
     assert "render" in said.getvalue()
-    assert "words" not in said.getvalue()
+    assert said.getvalue().endswith(f"\nwritten to {job.out}\n")

@@ -57,6 +57,7 @@ ROWS = [row("a", 18, 40.0), row("a", 23, 50.0), row("b", 18, 60.0), row("b", 23,
 def test_a_frames_savings_are_its_mean_over_settings_and_the_spread_is_over_frames():
     (mean,) = means_of(ROWS)
     assert (mean.frames, mean.savings_percent) == (2, 55.0)
+    assert mean.settings_percent == (50.0, 60.0), "of CRF 18 and of 23"
     assert mean.sd_percent == pytest.approx(np.std([45.0, 65.0], ddof=1))
     assert mean.ci95_percent == pytest.approx(1.96 * mean.sd_percent / 2**0.5)
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,6 @@ from rfcore.codec.references import RENDER_ONLY, References
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.field.own import OwnField
-from rfcore.named_class import make_named
 from rfcore.train.trainer import mean_psnr_db
 from rfedge.arguments import open_field
 from rfedge.evaluate.clips import (
@@ -35,6 +33,7 @@ from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.compare.foreground import ForegroundCoder, foreground_mask
 from rfedge.evaluate.field_coder import CRFS, WITHOUT_FIELD, FieldCoder, RenderedClip, render_clip
 from rfedge.evaluate.noted_coder import FrameNotes, NotedCoder, PictureCoder
+from rfedge.evaluate.own_coder import OwnCoder, own_coder
 from rfedge.evaluate.rate_curve import QUICK_POINTS
 from rfedge.evaluate.rivals import (
     Rival,
@@ -103,16 +102,6 @@ def _with_intra_refresh(preset: str) -> Rival:
     return x264_lowdelay(preset, f"x264-intra-refresh-10-{preset}", **params)
 
 
-def foreign_coder(text: str) -> ClipCoder:
-    """Return an instance of ``package.module:Class``; raise ``InvalidInput`` as ``make_named``
-    does, or for one that lacks a member."""
-    coder = make_named("method", text)
-    missing = [key for key in ("name", "points", "version", "code") if not hasattr(coder, key)]
-    if missing:
-        raise InvalidInput("method", f"{text!r} lacks {', '.join(missing)} of a ClipCoder")
-    return cast(ClipCoder, coder)
-
-
 @dataclass(frozen=True)
 class Method:
     """Settings of our coder; None leaves references to the encoder, the effort to the job."""
@@ -135,15 +124,20 @@ QUICK_METHODS = (METHODS[0], METHODS[-1])
 def asked_families(job: EvalCompare) -> dict[str, list[ClipCoder]]:
     """Return the rivals that are asked for, and the one that a field is paid for against.
 
-    Raises ``InvalidInput`` for a name that is no family of rivals.
+    Raises ``InvalidInput`` for a name that is neither a family of rivals nor a setting of one.
     """
     families = rival_families(job.preset)
+    known = dict.fromkeys([*families, *(c.name for those in families.values() for c in those)])
     for name in job.rivals:
-        if name not in families:
-            raise InvalidInput("rivals", f"{name!r} is none of {', '.join(families)}")
+        if name not in known:
+            raise InvalidInput("rivals", f"{name!r} is none of {', '.join(known)}")
     unasked = [f"x264-our-tools-{job.preset}"] if job.quick else families
     wanted = {PAID_AGAINST, *(job.rivals or unasked)}
-    return {name: family for name, family in families.items() if name in wanted}
+    asked = {
+        family: [c for c in those if family in wanted or c.name in wanted]
+        for family, those in families.items()
+    }
+    return {family: those for family, those in asked.items() if those}
 
 
 def jobs_of_drives(job: EvalCompare) -> list[EvalCompare]:
@@ -179,6 +173,8 @@ class DriveComparison:
     families: Mapping[str, Sequence[ClipCoder]]
     for_ssim: Mapping[str, Sequence[ClipCoder]]
     foreground_only: ForegroundCoder | None
+    own: Sequence[OwnCoder]
+    """Codecs of ``--method``, which are among the families, too."""
 
     @property
     def compared(self) -> list[ClipCoder]:
@@ -268,7 +264,8 @@ def _drive_comparison(
         noted = partial(_noted, Lpips(job.lpips_weights))
         methods = [*map(noted, methods)]
         families = {name: [*map(noted, those)] for name, those in families.items()}
-    families |= {coder.name: [coder] for coder in map(foreign_coder, job.method)}
+    own = [own_coder(given) for given in job.method]
+    families |= {coder.name: [coder] for coder in own}
     by_ssim = {} if job.rivals or job.quick else ssim_rivals()
     field_bytes = field.size_bytes if isinstance(field, OwnField) else given.field.stat().st_size
     return DriveComparison(
@@ -282,6 +279,7 @@ def _drive_comparison(
         families,
         by_ssim,
         rival,
+        own,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from itertools import product
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -29,37 +29,39 @@ from rfedge.results import Result, rows_of
 mpl.use("svg")
 
 SHOWN = {
-    "": ("#2563eb", "o"),
-    "x264-lowdelay": ("#1c2733", "s"),
-    "x264-lowdelay-psnr": ("#6b7785", "D"),
-    "x264-our-tools-medium": ("#9aa5b1", "x"),
-    "x265-lowdelay": ("#0f766e", "^"),
-    "svtav1-lowdelay": ("#d97706", "v"),
+    "": "o",
+    "x264-lowdelay": "s",
+    "x264-lowdelay-psnr": "D",
+    HEADLINE_ANCHOR: "x",
+    "x265-lowdelay": "^",
+    "svtav1-lowdelay": "v",
 }
-"""Families in the plot, ours first, each with its setting that needs the fewest bytes; codecs of
-``--method`` join them, and the CSV has all."""
+"""Families in the plot with their markers, ours first, each with its setting that needs the fewest
+bytes; codecs of ``--method`` join them, and the CSV has all."""
 RIVALS = {
-    "x264-our-tools-veryfast": ("#9aa5b1", "s"),
-    HEADLINE_ANCHOR: ("#1c2733", "o"),
-    "x264-our-tools-veryslow": ("#9aa5b1", "D"),
-    "x265-medium": ("#0f766e", "^"),
-    "svtav1-p6": ("#d97706", "v"),
-    BEST_OF_ANY_CPU: ("#be185d", "x"),
+    "x264-our-tools-veryfast": "s",
+    HEADLINE_ANCHOR: "o",
+    "x264-our-tools-veryslow": "D",
+    "x265-medium": "^",
+    "svtav1-p6": "v",
+    BEST_OF_ANY_CPU: "x",
 }
-"""Families beside one another in the figure of all drives."""
+"""Families beside one another in the figure of all drives; squares and diamonds are hollow."""
 CODECS = {
     "rfedge": "#2563eb",
     "x264-lowdelay-psnr": "#6b7785",
     "x264-our-tools": "#1c2733",
-    "x264": "#be185d",
-    "x265-lowdelay-psnr": "#0f766e",
-    "svtav1-lowdelay": "#d97706",
+    "x264": "#4d7c0f",
+    "x265": "#0f766e",
+    "svtav1": "#d97706",
+    BEST_OF_ANY_CPU: "#be185d",
 }
-OTHERS = ("#6d28d9", "#4d7c0f")
-"""Colours of codecs of ``--method``."""
-OTHER = "#9aa5b1"
-"""Colours of the frontier's codecs, by what their settings begin with."""
+"""Colours in all figures, by what names begin with."""
+OTHERS, OTHER_MARKERS = ("#6d28d9", "#0891b2", "#a16207"), "P*<>hp"
+"""Colours and markers of codecs of ``--method``."""
 LOW_DB, MIDDLE_DB, HIGH_DB = 29.0, 33.5, 38.0
+LOW_SHARE = 0.15
+"""Points in this lowest share of the frontier have their names above, off the axis."""
 
 
 def write_compare_figures(result: Result, folder: Path) -> list[Path]:
@@ -79,7 +81,8 @@ def write_compare_figures(result: Result, folder: Path) -> list[Path]:
 
 def _written(result: Result, stem: Path, figure: Figure, lines: Lines) -> list[Path]:
     if result["quick"]:
-        figure.suptitle("QUICK, not for figures", x=1, ha="right")
+        axes = figure.axes[0]
+        axes.set_xlabel(f"{axes.get_xlabel()} (QUICK, not for figures)")
     return write_figure(stem, figure, lines)
 
 
@@ -103,17 +106,16 @@ def _curves(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
             lines.append([curve.setting, *values])
     with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
         figure, axes = plt.subplots(figsize=(7.2, 3.6))
-        others = [each.family for each in curves if _is_other(each.family, each.setting)]
-        shown = {**SHOWN, **_styles_of(others)}
+        colours = _colours(each.setting for each in curves)
+        shown = {**SHOWN, **_markers_of_others(each.setting for each in curves)}
         if all(each.family != HEADLINE_ANCHOR for each in curves):
             anchors = [c.family for c in curves if c.family.startswith("x264-our-tools")]
             shown |= dict.fromkeys(anchors[:1], SHOWN[HEADLINE_ANCHOR])
-        for family, (colour, marker) in shown.items():
+        for family, marker in shown.items():
             those = [curve for curve in curves if curve.family == family]
             if those:
-                _draw(
-                    axes, those[0] if not family else min(those, key=_middle_bytes), colour, marker
-                )
+                curve = those[0] if not family else min(those, key=_middle_bytes)
+                _draw(axes, curve, colours[_codec(curve.setting)], marker)
         axes.set(xlabel="kB a frame", ylabel="Y-PSNR, dB", ylim=(LOW_DB, HIGH_DB), xscale="log")
         axes.legend(frameon=False, loc="upper left", fontsize=9)
     return figure, lines
@@ -128,16 +130,23 @@ def _frontier(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
     anchor = next(curve for curve in everybody if curve.family.startswith("x264-lowdelay"))
     lines: Lines = [["setting", "both_ends_ms", "bytes_percent"]]
     least = math.inf
+    colours = _colours(curve.setting for curve in everybody)
+    percents = {
+        curve.setting: 100 * math.exp(_middle_bytes(curve) - _middle_bytes(anchor))
+        for curve in everybody
+    }
     with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
         figure, axes = plt.subplots(figsize=(7.2, 3.6))
         for curve in sorted(everybody, key=lambda each: each.both_ends_ms):
-            percent = 100 * math.exp(_middle_bytes(curve) - _middle_bytes(anchor))
+            percent = percents[curve.setting]
             lines.append([curve.setting, f"{curve.both_ends_ms:.2f}", f"{percent:.2f}"])
             at = (curve.both_ends_ms, percent)
             codec = _codec(curve.setting)
-            axes.plot(*at, "o", color=CODECS.get(codec, OTHER), markersize=5, label=codec)
+            axes.plot(*at, "o", color=colours[codec], markersize=5, label=codec)
             if percent < least or not curve.family:
-                _name_point(axes, at, curve, above=len(axes.texts) % 2 == 0)
+                low = percent < LOW_SHARE * max(percents.values())
+                heights = (5, 14) if low else (5, -11)
+                _name_point(axes, at, curve, heights[len(axes.texts) % 2])
             least = min(least, percent)
         axes.set(xlabel="processor time of both ends, ms a frame", xscale="log", ylim=(0, None))
         axes.set_ylabel(f"bytes at {MIDDLE_DB:g} dB, % of\n{anchor.setting}")
@@ -159,23 +168,24 @@ def _codec(setting: str) -> str:
     return next((codec for codec in CODECS if setting.startswith(codec)), setting)
 
 
-def _is_other(family: str, setting: str) -> bool:
-    """Return whether a codec is none of ours and of the usual rivals: one of ``--method``."""
-    return family not in {**SHOWN, **RIVALS} and _codec(setting) not in CODECS
+def _colours(names: Iterable[str]) -> dict[str, str]:
+    """Return a colour for each codec: those of ``--method`` get theirs in their order."""
+    others = dict.fromkeys(codec for codec in map(_codec, names) if codec not in CODECS)
+    return {**CODECS, **dict(zip(others, cycle(OTHERS), strict=False))}
 
 
-def _styles_of(families: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return a colour and a marker for each family of ``--method``."""
-    return dict(zip(dict.fromkeys(families), product(OTHERS, "P*<>hp"), strict=False))
+def _markers_of_others(settings: Iterable[str]) -> dict[str, str]:
+    """Return a marker for each codec of ``--method``, whose family has its name."""
+    others = dict.fromkeys(name for name in settings if _codec(name) not in CODECS)
+    return dict(zip(others, cycle(OTHER_MARKERS), strict=False))
 
 
-def _name_point(axes: Any, at: tuple[float, float], curve: CurveRow, *, above: bool) -> None:
+def _name_point(axes: Any, at: tuple[float, float], curve: CurveRow, height_pt: int) -> None:
     """Write a setting's name without its codec's, which the colour tells."""
-    offset = (0, 5) if above else (0, -11)
     axes.annotate(
         _label(curve).removeprefix(_codec(curve.setting)).lstrip("-"),
         at,
-        offset,
+        (0, height_pt),
         textcoords="offset points",
         fontsize=7,
         ha="center",
@@ -217,14 +227,17 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
     drives = list(dict.fromkeys((row.scene, row.hz) for row in ours))
     with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
         figure, axes = plt.subplots(figsize=(7.2, 0.3 * len(drives) + 1.2))
-        others = [row.rival for row in ours if _is_other(row.rival, row.rival_setting)]
-        for rival, (colour, marker) in {**RIVALS, **_styles_of(others)}.items():
+        settings = [row.rival_setting for row in ours]
+        colours = _colours(settings)
+        for rival, marker in {**RIVALS, **_markers_of_others(settings)}.items():
             those = [row for row in ours if row.rival == rival]
             if not those:
                 continue
             places = [drives.index((row.scene, row.hz)) for row in those]
             values = [row.bd_rate_percent for row in those]
-            axes.plot(values, places, marker, color=colour, markersize=5, label=rival)
+            colour, fill = colours[_codec(rival)], "none" if marker in "sD" else "full"
+            style = {"color": colour, "fillstyle": fill, "markersize": 5, "label": rival}
+            axes.plot(values, places, marker, **style)
             intervals = [row.ci95 for row in those if row.ci95 is not None]
             if rival == HEADLINE_ANCHOR and intervals:  # all or, of a quick run, none
                 axes.hlines(places, *zip(*intervals, strict=True), color=colour)

@@ -7,6 +7,7 @@ digest of the field that it predicts from.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -44,17 +45,24 @@ class CompareRow:
     ci95: Sequence[float] | None = field(metadata=shown("95 %", "{:.1f}..{:.1f}"))
     """Interval of the BD-rate from blocks of frames drawn with replacement; None of a quick run."""
     points: int
+    """Operating points of the method's curve."""
     saving_percent_at_db: Mapping[str, float]
     """Saving by luma PSNR; a quality that a curve does not reach is left out."""
     first_frame_bytes: int
+    """Bytes of the first frame at the point nearest the middle of the window, as ``ssim``,
+    ``psnr_deviation_db`` and the rival's."""
     rival_first_frame_bytes: int
     ssim: float
+    """Mean over the frames."""
     rival_ssim: float
     psnr_deviation_db: float
+    """Standard deviation of the frames' luma PSNR."""
     rival_psnr_deviation_db: float
     cpu_ms: float
+    """Processor time of the sender, a frame: median of interleaved rounds."""
     rival_cpu_ms: float
     both_ends_ms: Sequence[float] = field(metadata=shown("both ends ms", "{:.0f} ({:.0f}..{:.0f})"))
+    """Processor time of sender and receiver, a frame: median, least and most of the rounds."""
     rival_both_ends_ms: Sequence[float] = field(
         metadata=shown("the rival's", "{:.0f} ({:.0f}..{:.0f})")
     )
@@ -96,6 +104,7 @@ class QualityRow:
     hz: float
     method: str
     rival: str
+    """The family of settings."""
     rival_setting: str = field(metadata=shown("rival"))
     window: Sequence[float] = field(metadata=shown("window", "{:g}..{:g}"))
     bd_rate_percent: float = field(metadata=shown("BD-rate %", "+.1f"))
@@ -109,10 +118,15 @@ class BreakEvenRow:
     hz: float
     method: str
     rival: str
+    """The setting that the field is paid for against."""
     at_db: float
+    """Luma PSNR that bytes are compared at: 33 dB, or the lowest above it that both curves have."""
     frames_per_pass: int
+    """Frames of the drive, the first among them."""
     field_bytes: int
+    """Size of the field's archive, which is sent once."""
     saved_bytes_per_pass: float
+    """Bytes that ours takes less than the rival for the whole drive."""
     passes_to_break_even: int | None = field(
         metadata=shown("passes to break even", "d", missing="never")
     )
@@ -128,6 +142,7 @@ class BitShareRow:
     hz: float
     method: str
     crf: float
+    """The CRF of our coder at which frames were split."""
     shows: str = field(metadata=shown("macroblocks"))
     area_percent: float = field(metadata=shown("of the picture, %", ".0f"))
     slice_percent: float = field(metadata=shown("of the bytes, %", ".0f"))
@@ -141,13 +156,19 @@ class ForegroundRow:
     scene: str
     hz: float
     mask: str
+    """How the foreground was found."""
     foreground_percent: float
+    """Share of the pixels, mean over the frames."""
     window_db: Sequence[float] | None
+    """PSNR of the foreground's pixels that both curves have."""
     bd_rate_percent: float | None
     """None, as ``window_db``, if the curves share less than a decibel."""
     whole_picture_ceiling_db: float
+    """Best luma PSNR of whole pictures, render behind the foreground, that the rival reaches."""
     ours: Mapping[str, Sequence[float]]
+    """Curve of the foreground: bytes a frame over PSNR."""
     rfdvc_style: Mapping[str, Sequence[float]]
+    """The same of the rival, which sends the foreground and shows the render behind it."""
 
 
 @dataclass(frozen=True)
@@ -159,13 +180,21 @@ class CurveRow:
     family: str
     """Family of the rival; empty for ours."""
     setting: str
+    """Name of the coder with its settings."""
     cpu_ms: float
+    """Processor time of the sender, a frame."""
     both_ends_ms: float
+    """Processor time of sender and receiver, a frame."""
     point: Sequence[float]
+    """Operating points (CRF, or what the codec takes), in the order of the columns below."""
     psnr_db: Sequence[float]
+    """PSNR of the luma's mean squared error over all frames but the first, as all columns below."""
     bytes_per_frame: Sequence[float]
+    """Mean over the frames."""
     ssim: Sequence[float]
+    """Mean over the frames."""
     lpips: Sequence[float] | None = None
+    """Mean over the frames; with ``--lpips-weights`` only."""
 
 
 BY_QUALITY = {SSIM: "By SSIM, against rivals tuned for it", LPIPS: f"By {LPIPS.title}"}
@@ -193,8 +222,12 @@ def compare_parts(result: Result) -> Iterator[Table | str]:
     if bits:
         yield Table("Where the bits go, near 33.5 dB", [DRIVE, *columns(BitShareRow)], bits)
     yield from map(_foreground_line, rows_of(ForegroundRow, result.get("foreground", ())))
-    for rows in _by_drive(of_first_method(of_first_window(compared))).values() if compared else ():
+    first = of_first_window(compared) if compared else []
+    for rows in _by_drive(of_first_method(first)).values():
         yield _summary(rows, break_even)
+    own = [row for row in first if is_own(row.method) and row.rival == _anchor(compared)]
+    for row in own:
+        yield f"{_drive(row)}: {row.method} takes {_fewer(row.bd_rate_percent)} than {_than(row)}."
 
 
 def _summary(rows: Sequence[CompareRow], break_even: Sequence[BreakEvenRow]) -> str:
@@ -205,11 +238,7 @@ def _summary(rows: Sequence[CompareRow], break_even: Sequence[BreakEvenRow]) -> 
     also = ""
     if best.rival_setting != anchor.rival_setting:
         also = f", and {_fewer(best.bd_rate_percent)} than the strongest, {best.rival_setting}"
-    text = (
-        f"{_drive(one)}: {_fewer(anchor.bd_rate_percent)} than {anchor.rival_setting} at equal "
-        "quality ({:g}..{:g} dB)".format(*one.window_db)
-        + f"{also}."
-    )
+    text = f"{_drive(one)}: {_fewer(anchor.bd_rate_percent)} than {_than(anchor)}{also}."
     for paid in break_even:
         if (paid.scene, paid.hz, paid.method) == (one.scene, one.hz, one.method):
             passes = paid.passes_to_break_even
@@ -219,6 +248,10 @@ def _summary(rows: Sequence[CompareRow], break_even: Sequence[BreakEvenRow]) -> 
                 f"(against {paid.rival})."
             )
     return text
+
+
+def _than(row: CompareRow) -> str:
+    return f"{row.rival_setting} at equal quality ({{:g}}..{{:g}} dB)".format(*row.window_db)
 
 
 def _fewer(bits_percent: float) -> str:
@@ -282,10 +315,18 @@ def _anchor(compared: Sequence[CompareRow]) -> str:
 
 
 def without_field(method: str) -> str:
-    """Return a method's name without the digest of its field, its effort once."""
+    """Return a method's name without the digest of its field, its effort once; a codec of
+    ``--method`` has neither."""
+    if is_own(method):
+        return method
     name = method.rsplit("-", 1)[0]
     without_effort, _, effort = name.rpartition("-")
     return without_effort if without_effort.endswith(f"-{effort}") else name
+
+
+def is_own(method: str) -> bool:
+    """Return whether a method is a codec of ``--method``: its name lacks the digest of a field."""
+    return re.search(r"-[0-9a-f]{12}$", method) is None
 
 
 def of_first_window(rows: Sequence[CompareRow]) -> list[CompareRow]:

@@ -17,10 +17,13 @@ from typing import Any
 
 from rich.console import Console
 
+from rfcore.dataset.bag_file import is_bag
+from rfcore.dataset.read import read_source
 from rfcore.errors import InvalidInput
+from rfcore.named_class import module_file
 from rfcore.program import working
 from rfedge.arguments import time_text
-from rfedge.evaluate.clips import QUICK, Clip, ClipCoder
+from rfedge.evaluate.clips import QUICK, Clip, ClipCoder, DriveName, DriveOfField
 from rfedge.evaluate.compare import EvalCompare
 from rfedge.evaluate.compare.bits import SplitClip, split_rows
 from rfedge.evaluate.compare.drives import (
@@ -73,8 +76,7 @@ def run_compare(job: EvalCompare, console: Console) -> dict[str, Any]:
     """
     asked_families(job)
     comparisons = read_drive_comparisons(job)
-    fields = dict.fromkeys(comparison.field for comparison in comparisons)
-    run = Run.begin("compare", job, fields, console)
+    run = Run.begin("compare", job, _inputs(job), console)
     _announce(job, comparisons, run)
     run.parallel(_jobs(job), job.processes, job.ray)
     progress = _Progress(comparisons, run.store)
@@ -88,6 +90,18 @@ def run_compare(job: EvalCompare, console: Console) -> dict[str, Any]:
             tables.setdefault(name, []).extend(rows)
     frames = {f"{b.clip.scene}@{b.clip.rate_hz:g}": _frames(b) for b in comparisons}
     return run.finish({"frames": frames, **tables}, compare_parts)
+
+
+def _inputs(job: EvalCompare) -> list[Path]:
+    """Return the files of fields, drives and codecs that the command names; of a class, its
+    module's."""
+    drives = [DriveOfField.parse(text, job.field) for text in (*job.drives, *job.decimated)]
+    shown = [drive.name.dataset for drive in drives]
+    shown += [DriveName.parse(text).dataset for text in job.background]
+    # Of a folder the file that describes it; a bag is no such file, and long to read.
+    files = [read_source(p).file if p.is_dir() and not is_bag(p) else p for p in shown]
+    named = [*(str(drive.field) for drive in drives), *job.method]
+    return list(dict.fromkeys([*(module_file(each) or Path(each) for each in named), *files]))
 
 
 def _windows_db(job: EvalCompare) -> tuple[Window, ...]:
@@ -244,6 +258,17 @@ def _tables(job: EvalCompare, comparison: DriveComparison, run: Run) -> dict[str
                 method,
                 families,
                 _windows_db(job) if method is methods[0] else [window],
+                interval=not job.quick,
+            )
+        ]
+        + [
+            row
+            for own in comparison.own
+            for row in compare_rows(
+                clip,
+                by_name[own.name],
+                {name: those for name, those in families.items() if name != own.name},
+                [window],
                 interval=not job.quick,
             )
         ],

@@ -24,8 +24,11 @@ class LadderRow:
     """Time by the clock, as ``receiver_wall_ms``: other processes count."""
     receiver_wall_ms: float
     sender_stage_ms: Mapping[str, float]
+    """Time of each stage of the sender, by its name."""
     receiver_stage_ms: Mapping[str, float]
+    """Time of each stage of the receiver, by its name."""
     bits_per_frame: float
+    """Mean size of a frame's message."""
     psnr_db: float = field(metadata=shown("PSNR dB", ".2f"))
     ssim: float = field(metadata=shown("SSIM", ".3f"))
     references_used: Mapping[str, int]
@@ -33,6 +36,7 @@ class LadderRow:
     rate_percent: float = field(metadata=shown("rate %", "+.1f"))
     """Bits at equal quality above the first rung's."""
     on_front: bool
+    """Whether no other rung is as quick with fewer bits."""
 
     @property
     def crf(self) -> float:

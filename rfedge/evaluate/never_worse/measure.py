@@ -51,9 +51,11 @@ class NeverWorseRow:
     scene: str
     hz: float
     frames: int
+    """Frames of the drive."""
     control: str = field(metadata=shown("field"))
     """The field that both ends hold."""
     preset: str
+    """Preset of x264, the rival."""
     at_db: float = field(metadata=shown("dB", "g"))
     bytes: float = field(metadata=shown("bytes", ".0f"))
     header_bytes: float = field(metadata=shown("header bytes", ".0f"))
@@ -63,7 +65,9 @@ class NeverWorseRow:
     excess_percent_psnr_tuned: float = field(metadata=shown("over x264 tuned for PSNR, %", "+.1f"))
     """The same against x264 tuned for PSNR."""
     holds: bool
+    """Whether ``excess_percent`` is within its limit."""
     first_frame_bytes: int
+    """Bytes of the first frame at this quality."""
     rival_first_frame_bytes: int
     references: str = field(metadata=shown("mostly predicted from"))
     """The picture that most frames were predicted from."""
