@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
-from rfedge.evaluate.compare.figures import _bd_rates, write_compare_figures
+from rfedge.evaluate.compare.figures import (
+    _bd_rates,
+    _curves,
+    _frontier,
+    write_compare_figures,
+)
 from rfedge.evaluate.compare.rows import CompareRow, CurveRow
+from rfedge.results import rows_of
 
 OURS, MINE = "rfedge-default-0123456789ab", "my-codec-q"
 DRIVE = {"scene": "empty", "hz": 10.0}
@@ -41,6 +47,28 @@ def test_a_codec_of_ones_own_and_the_anchor_of_a_quick_run_are_drawn(tmp_path):
         drawn = (tmp_path / f"{name}.svg").read_text()
         assert MINE in drawn, name
         assert "x264-our-tools-veryfast" in drawn, name
+
+
+def test_a_codec_has_one_colour_in_all_figures():
+    settings = [MINE, "another-q", "x264-our-tools-medium"]
+    anchor = curve("x264-lowdelay", "x264-lowdelay-veryfast", 4000.0)
+    curves = [curve("", OURS, 500.0), anchor, *(curve(each, each, 900.0) for each in settings)]
+    rows = [compared("best-comparable", MINE, -9.0), *(compared(s, s, -9.0) for s in settings)]
+    figures = [
+        *(draw(rows_of(CurveRow, curves))[0] for draw in (_curves, _frontier)),
+        _bd_rates(rows_of(CompareRow, rows))[0],
+    ]
+    drawn = {
+        name: [
+            line.get_color()
+            for figure in figures
+            for line in figure.axes[0].lines
+            if line.get_label() == name
+        ]
+        for name in settings[:2]
+    }
+    assert all(len(found) == 3 for found in drawn.values())
+    assert len({colour for found in drawn.values() for colour in found}) == 2
 
 
 @pytest.mark.parametrize("interval", [[-82.0, -79.0], None])

@@ -12,6 +12,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from rfcore.errors import InvalidInput
 from rfedge.evaluate.compare.rows import (
@@ -149,6 +150,9 @@ def _frontier(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
                 _name_point(axes, at, curve, heights[len(axes.texts) % 2])
             least = min(least, percent)
         axes.set(xlabel="processor time of both ends, ms a frame", xscale="log", ylim=(0, None))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel(f"bytes at {MIDDLE_DB:g} dB, % of\n{anchor.setting}")
         by_codec = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
         axes.legend(
