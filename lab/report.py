@@ -5,12 +5,10 @@ A page is made of every result file of its kind, a section each, so that it is n
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rfcore.program import verbs_of
 from rfedge.report.tables import Parts, Table
 from rfedge.results import Result
 
@@ -84,17 +82,7 @@ def _measured(name: str, result: Result) -> str:
         f"`{result['command']}` at `{result['revision']}` on {described_host(result)}; "
         f"every figure is in `{name}.json`."
     )
-    return folded("How it was measured", told + _moved(result["command"]))
-
-
-def _moved(command: str) -> str:
-    """Return what the program is called now, of a command that was one of ``rfedge``."""
-    from lab.cli import Verb
-
-    old = re.match(r"rfedge (?:eval )?([\w-]+)", command)
-    if old is None or old[1] not in verbs_of(Verb):
-        return ""
-    return f" `{old[0]}` is now `rfedge-lab {old[1]}`."
+    return folded("How it was measured", told)
 
 
 def described_host(result: Result) -> str:

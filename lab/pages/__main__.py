@@ -6,12 +6,14 @@ lists them, ``figures/``, and what stands between two marks in ``README.md``.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lab.adapt.measure import REPORT as ADAPT
 from lab.benchmark.definition import REPORT as BENCHMARK
 from lab.classes.measure import REPORT as CLASSES
+from lab.cli import Verb
 from lab.cold_start import REPORT as COLD_START
 from lab.detect.measure import REPORT as DETECT
 from lab.head import REPORT as HEAD
@@ -31,6 +33,7 @@ from lab.soak import REPORT as SOAK
 from lab.tcp.run import REPORT as TCP
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
+from rfcore.program import verbs_of
 from rfedge.results import Result, read_result
 from rfedge.sizing.tables import SHIPPED
 
@@ -85,9 +88,20 @@ def write_figures(results: Recorded, folder: Path) -> dict[str, list[Path]]:
 def pages(results: Recorded, drawn: Mapping[str, Sequence[Path]]) -> dict[str, str]:
     """Return the text of each page by its name, the index among them."""
     shown = [report for kind, report in KINDS.items() if kind in results]
-    texts = {report.kind: page_of(report, results[report.kind], drawn) for report in shown}
+    texts = {r.kind: _with_moved(page_of(r, results[r.kind], drawn)) for r in shown}
     lines = [f"* [{report.title}]({report.kind}.md): {report.shows}" for report in shown]
     return {**texts, "index": "\n".join([INDEX, *lines, ""])}
+
+
+def _with_moved(page: str) -> str:
+    """Return a page that says what a command is called now that was one of ``rfedge``."""
+    names = "|".join(verbs_of(Verb))
+    return re.sub(
+        rf"^(`(rfedge (?:eval )?({names}))\b.*)$",
+        r"\1 `\2` is now `rfedge-lab \3`.",
+        page,
+        flags=re.M,
+    )
 
 
 def with_headline(page: str, results: Recorded) -> str:

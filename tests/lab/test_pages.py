@@ -42,6 +42,12 @@ def test_every_recorded_result_renders_in_tables_that_fit_a_screen(results):
     assert set(made) == {*KINDS, "index"} - {"soak"}, "each kind has a page and a line of the index"
 
 
+def test_a_page_names_the_command_of_today(results):
+    made = pages(results, {})
+    assert "`rfedge eval paper` is now `rfedge-lab paper`" in made["paper"]
+    assert "is now" not in made["compare"] + made["seams"]
+
+
 @pytest.mark.slow
 def test_the_committed_pages_and_figures_are_those_of_the_results(results, tmp_path):
     drawn = write_figures(results, tmp_path)
