@@ -264,8 +264,8 @@ def _drive_comparison(
         noted = partial(_noted, Lpips(job.lpips_weights))
         methods = [*map(noted, methods)]
         families = {name: [*map(noted, those)] for name, those in families.items()}
-    own = [own_coder(given) for given in job.method]
-    families |= {coder.name: [coder] for coder in own}
+    users = [own_coder(text) for text in job.method]
+    families |= {coder.name: [coder] for coder in users}
     by_ssim = {} if job.rivals or job.quick else ssim_rivals()
     field_bytes = field.size_bytes if isinstance(field, OwnField) else given.field.stat().st_size
     return DriveComparison(
@@ -279,7 +279,7 @@ def _drive_comparison(
         families,
         by_ssim,
         rival,
-        own,
+        users,
     )
 
 

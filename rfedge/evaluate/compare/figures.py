@@ -240,8 +240,8 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
             places = [drives.index((row.scene, row.hz)) for row in those]
             values = [row.bd_rate_percent for row in those]
             colour, fill = colours[_codec(rival)], "none" if marker in "sD" else "full"
-            style = {"color": colour, "fillstyle": fill, "markersize": 5, "label": rival}
-            axes.plot(values, places, marker, **style)
+            (drawn,) = axes.plot(values, places, marker, color=colour, markersize=5, label=rival)
+            drawn.set_fillstyle(fill)
             intervals = [row.ci95 for row in those if row.ci95 is not None]
             if rival == HEADLINE_ANCHOR and intervals:  # all or, of a quick run, none
                 axes.hlines(places, *zip(*intervals, strict=True), color=colour)
@@ -249,8 +249,8 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
         axes.tick_params("y", labelsize=8)
         axes.invert_yaxis()
         axes.set_xlabel("BD-rate of ours against the rival, %")
-        drawn = [value for row in ours for value in (row.bd_rate_percent, *(row.ci95 or ()))]
-        axes.set_xlim(min(drawn) - 5, max(0.0, *drawn) + 5)
+        shown = [value for row in ours for value in (row.bd_rate_percent, *(row.ci95 or ()))]
+        axes.set_xlim(min(shown) - 5, max(0.0, *shown) + 5)
         if axes.lines:
             axes.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1), fontsize=8)
     return figure, lines
