@@ -239,9 +239,9 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
                 continue
             places = [drives.index((row.scene, row.hz)) for row in those]
             values = [row.bd_rate_percent for row in those]
-            colour, fill = colours[_codec(rival)], "none" if marker in "sD" else "full"
+            colour = colours[_codec(rival)]
             (drawn,) = axes.plot(values, places, marker, color=colour, markersize=5, label=rival)
-            drawn.set_fillstyle(fill)
+            drawn.set_fillstyle("none" if marker in "sD" else "full")
             intervals = [row.ci95 for row in those if row.ci95 is not None]
             if rival == HEADLINE_ANCHOR and intervals:  # all or, of a quick run, none
                 axes.hlines(places, *zip(*intervals, strict=True), color=colour)
