@@ -1,7 +1,7 @@
 # Results of `rfedge eval` and `rfedge-lab` for lab/results, made on a quiet machine from a committed revision:
 #     make results [DATA=FOLDER]         what takes two hours of two cores
 #     make results-full [DATA=FOLDER]    the rest, too, which takes days
-# DATA is a folder that has `street` (the yardstick), `kitti/city` and `kitti/loop` (docs/how-to/data.md); without it the
+# DATA is a folder that has `street` (the yardstick), `kitti/city` and `kitti/loop` (docs/how-to/compare.md); without it the
 # sample's drives are compared alone. A record that is in out/results is not made
 # again: delete its file there. Faults and attacks have targets in the Makefile, loads in lab/targets.mk.
 OUT    ?= out/results
