@@ -162,7 +162,10 @@ class DriveObserver:
     def explanation(self) -> str:
         """Return why no picture of a drive was acknowledged, and what to do."""
         if not self._unacknowledged:
-            return "no picture was taken: let it drive longer, and see above what it waited for"
+            return (
+                "no picture was taken: the last lines above (no connection, waiting) say what the "
+                "vehicle waited for"
+            )
         counts = self._unacknowledged.most_common()
         ends = ", ".join(f"{count} {outcome} ({reason})" for (outcome, reason), count in counts)
         problem = f"; last problem: {self._problem}" if self._problem else ""

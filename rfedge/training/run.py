@@ -172,8 +172,8 @@ def check_memory(needed: int, available: int | None) -> None:
 
 JUDGED, MEANT = 8, 16
 """Pictures by which a field is judged, and those whose mean colour it has to beat."""
-PASSES = 10
-"""Iterations for each picture below which a run is short."""
+PASSES, RISING_PASSES = 10, 30
+"""Iterations for each picture below which a run is short, and below which quality rises fast."""
 LEVELS_SHARE = 0.05
 """Share of a run limited by time that fitting levels of detail has at least."""
 UNLIMITED_ITERATIONS = 1_000_000
@@ -386,8 +386,9 @@ def outcome_of(job: TrainingJob, trained: Trained, field: RadianceField) -> Outc
     few = trained.iterations < PASSES * len(shown)
     more = "--minutes" if job.limits.minutes is not None else "--iterations"
     remedy = "check its poses (rfedge field check), or give points (--points)"
+    give_more = f"these are few for {len(shown)} pictures: give more {more}, or a smaller --size"
     if few:
-        remedy = f"these are few for {len(shown)} pictures: give more {more}, or a smaller --size"
+        remedy = give_more
     if psnr_db <= mean_db:
         problem = f"no better than their mean colour ({mean_db:.2f} dB): of no use"
         was_asked_for = few and job.limits.minutes is None
@@ -395,6 +396,8 @@ def outcome_of(job: TrainingJob, trained: Trained, field: RadianceField) -> Outc
     if psnr_db < FITS_DB:
         problem = f"below {FITS_DB:g} dB commands take it for a field of another place"
         return Outcome(f"{text}; {problem}; {remedy}", False)
+    if trained.iterations < RISING_PASSES * len(shown):
+        return Outcome(f"{text}; {give_more}", False)
     if job.held_out is None:
         return Outcome(f"{text}; --holdout 8 says how good other views are", False)
     return Outcome(text, False)

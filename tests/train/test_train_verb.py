@@ -179,6 +179,12 @@ def test_a_few_iterations_that_were_asked_for_are_no_failure(wall, tmp_path, now
     )
 
 
+def test_a_run_that_was_short_says_that_more_would_help(wall, tmp_path, capsys):
+    verb(wall, tmp_path / "a.rff", iterations=80).run()
+    shown = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"dB held out after 80 iterations; these are few .* --iterations", shown)
+
+
 def test_a_run_ends_with_its_quality_and_iterations(wall, tmp_path, capsys):
     verb(wall, tmp_path / "a.rff").run()
     held_out_db = load_field(tmp_path / "a.rff").metadata.held_out_psnr_db
