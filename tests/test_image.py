@@ -66,7 +66,7 @@ def test_planes_are_packed_and_unpacked(size_px):
 def test_files_are_the_same_without_the_processors_vector_instructions():
     """FFmpeg's own switch turns them off; without a quantiser its JPEG differs by them."""
     maps = Path("/proc/self/maps").read_text().split()
-    libavutil = ctypes.CDLL(next(word for word in maps if "libavutil" in word))
+    libavutil = ctypes.CDLL(next(word for word in maps if "av.libs/libavutil" in word))
     v, u = np.mgrid[:360, :640]
     waves = [np.sin(u / 7 + v / 11), np.cos(u / 13), np.sin(v / 5)]
     rgb = (127 + 120 * np.stack(waves, axis=2)).astype(np.uint8)

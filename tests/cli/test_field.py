@@ -278,7 +278,7 @@ def test_a_field_is_looked_at_around_and_along_a_drive(here, splats, drive, caps
         (FieldInfo(Path("nowhere")), InvalidInput, "'nowhere' is no field.*out/fields/nowhere.rff"),
         (Encode(Path("drive"), Path("no"), Path("o.rfv")), InvalidInput, "'no' is no field"),
         (Render(Path("a.rff"), Path("o.gif")), InvalidInput, r"no \.gif file .*\.mp4"),
-        (Decode(Path("a.rfv"), Path("a.rff"), Path("o.avi")), InvalidInput, "a folder for PNG"),
+        (Decode(Path("a.rff"), Path("a.rff"), Path("o.avi")), InvalidInput, "a folder for PNG"),
         (FieldSlim(Path("a.rff"), Path("b.rff"), 9999), InvalidInput, r"outside 1\.\.200"),
         (Render(Path("a.rff"), Path("o"), path="drive"), InvalidInput, "needs --drive"),
         (Render(Path("a.rff"), Path("o"), frames=0), InvalidInput, "frames"),

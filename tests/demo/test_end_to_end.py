@@ -49,7 +49,7 @@ def test_the_server_ends_up_with_the_vehicles_pictures(tiny_sample, tmp_path):
 
 def in_a_browser(said: str) -> None:
     """The line that the demo ends with names a field and a drive that `rfedge twin` takes."""
-    (command,) = re.findall(r"^in a browser: rfedge (.*)$", said, re.MULTILINE)
+    (command,) = re.findall(r"^in a browser: \S*rfedge (.*)$", said, re.MULTILINE)
     verb: Any = tyro.cli(Verb, args=shlex.split(command), config=(OmitSubcommandPrefixes,))
     assert load_field(Path(verb.target)).primitives > 0
     assert len(read_dataset(verb.drive).pictures) == 4

@@ -96,7 +96,7 @@ def edited(path: Path, old: str, new: str) -> None:
         ("binary_little_endian 1.0", "binary_little_endian 2.0", "1.0 is needed"),
         ("element vertex 4", "element chunk 1", "no chunk property min_x"),
         ("property float nx", "property float filter_3D", "create_fused_ply"),
-        ("ply\n", "plx\n", "neither a .ply nor a .spz by its content: it begins with b'plx"),
+        ("ply\n", "plx\n", "is no .ply, .spz or .glb by its content: it begins with b'plx"),
         ("end_header", "end_of_it", "no 'end_header'|not a scalar"),
         ("element vertex 4", "element vertex many", "does not state a count"),
         ("element vertex 4", "element vertex -4", "does not state a count"),
