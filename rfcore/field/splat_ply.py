@@ -16,7 +16,8 @@ colour and opacity of 8 bits), and where there is more than degree 0 ``sh`` with
 How splats are to be drawn is a comment of the header, ``SplatRenderMode: mip`` (antialiased: a
 splat smaller than a pixel is made fainter) or ``SplatRenderMode: default``, as gsplat (pull request
 1036), nerfstudio (3773) and Brush write it. The last such comment counts, in any letter case.
-Postshot's ``antialiased 0`` or ``1`` is read as well.
+Postshot's ``antialiased 0`` or ``1`` is read as well. Which way is up is a comment of our own,
+``rfedge up: X Y Z``, a unit vector.
 
 Two properties that change what the others mean are refused by name rather than ignored:
 ``filter_3D`` of Mip-Splatting (its own ``create_fused_ply.py`` fuses it in), and two scales
@@ -33,6 +34,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from rfcore.camera import Vec3
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field.ply_table import (
     VERTEX,
@@ -48,6 +50,7 @@ from rfcore.field.splat_archive import check_decoded_size
 from rfcore.field.stored_splats import F64, StoredSplats, finite_logits, middle_of, sh_degree_of
 from rfcore.harmonics import SH_DC
 from rfcore.raster.gaussians import F32, Gaussians, empty_arrays
+from rfcore.vertical import check_direction
 
 XYZ = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
@@ -59,6 +62,9 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 MODES = {"splatrendermode:mip": True, "splatrendermode:default": False}
 """Comments without their spaces, in lower case, and whether splats are drawn antialiased."""
 POSTSHOT_MODES = {"antialiased1": True, "antialiased0": False}
+
+UP = "rfedge up:"
+"""Start of the comment that says which way is up."""
 
 CHUNK = 256
 """Splats of a chunk."""
@@ -103,7 +109,7 @@ def _read_inria(path: Path, file: BinaryIO, header: Header, max_bytes: int) -> S
         antialiased=antialiased_of(path, header.comments),
         step_m=_step_m(vertex, means_m),
         notes=("colours are red, green, blue, the same from all sides",) if plain else (),
-        up=None,
+        up=up_of(path, header.comments),
     )
 
 
@@ -222,7 +228,7 @@ def _read_compressed(path: Path, file: BinaryIO, header: Header, max_bytes: int)
         antialiased=antialiased_of(path, header.comments),
         step_m=0.0,
         notes=(),
-        up=None,
+        up=up_of(path, header.comments),
     )
 
 
@@ -269,10 +275,31 @@ def antialiased_of(path: Path, comments: Sequence[str]) -> bool | None:
     return stated
 
 
-def write_ply(path: Path, gaussians: Gaussians, *, antialiased: bool | None = None) -> None:
+def up_of(path: Path, comments: Sequence[str]) -> Vec3 | None:
+    """Return which way the comments of a header say is up, or ``None``.
+
+    Raises ``FieldFormatError`` if that is no unit vector.
+    """
+    stated = [comment for comment in comments if comment.startswith(UP)]
+    if not stated:
+        return None
+    try:
+        x, y, z = map(float, stated[-1].removeprefix(UP).split())
+        check_direction("up", (x, y, z))
+    except ValueError as error:
+        raise FieldFormatError(
+            f"{path}: its comment '{stated[-1]}' is no unit vector X Y Z; correct it in the header"
+        ) from error
+    return x, y, z
+
+
+def write_ply(
+    path: Path, gaussians: Gaussians, *, antialiased: bool | None = None, up: Vec3 | None = None
+) -> None:
     """Write Gaussians as the reference implementation does; float32 survives exactly.
 
-    ``antialiased`` becomes the ``SplatRenderMode`` comment; ``None`` writes no such comment.
+    ``antialiased`` becomes the ``SplatRenderMode`` comment, ``up``, a unit vector, the one of the
+    vertical; ``None`` writes no such comment.
     """
     rest_count = 3 * (gaussians.sh.shape[1] - 1)
     rest = tuple(f"f_rest_{i}" for i in range(rest_count))
@@ -289,4 +316,5 @@ def write_ply(path: Path, gaussians: Gaussians, *, antialiased: bool | None = No
     rows = np.concatenate(parts, axis=1).astype("<f4")
     comments = {None: (), True: ("SplatRenderMode: mip",), False: ("SplatRenderMode: default",)}
     table = rows.view([(name, "<f4") for name in names])[:, 0]
-    write_vertices(path, table, comments[antialiased])
+    stated = () if up is None else (f"{UP} {' '.join(f'{value:.9g}' for value in up)}",)
+    write_vertices(path, table, (*comments[antialiased], *stated))

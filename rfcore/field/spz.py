@@ -14,9 +14,10 @@ its sky, which is brought to 2 km.
 
 **Axes.** The extension ``COORDINATE_SYSTEM`` (SPZ_ADOBE_coordinate_system) names what x, y and z of
 the file point to; it is obeyed, so that splats come in with the axes of a .ply, RDF (right, down,
-front). Version 4 is written with it. Without it, tools disagree: splat-transform 3 keeps the axes
-of a .ply, Niantic's library and splat-transform 2 turn them half round x. Such a file is taken as
-it is.
+front), in which up is -y. Version 4 is written with it, and where the field's vertical is another
+with a record of our own, the vertical as three float32. Without it, tools disagree: splat-transform
+3 keeps the axes of a .ply, Niantic's library and splat-transform 2 turn them half round x. Such a
+file is taken as it is.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from typing import BinaryIO, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Pose
+from rfcore.camera import Pose, Vec3
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.extras import needs
 from rfcore.field.similarity import turned_rotations, turned_sh
@@ -42,6 +43,7 @@ from rfcore.field.splat_archive import check_decoded_size
 from rfcore.field.stored_splats import F64, StoredSplats, finite_logits
 from rfcore.files import write_whole
 from rfcore.raster.gaussians import F32, Gaussians, with_sky_at
+from rfcore.vertical import check_direction
 
 MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")
@@ -53,6 +55,8 @@ ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
 RECORD = struct.Struct("<II")
 MAX_EXTENSIONS_BYTES = 1 << 24
 COORDINATE_SYSTEM = 0xADBE0003
+VERTICAL, DIRECTION = 0x52460001, struct.Struct("<fff")
+"""Our own extension, which is obeyed in a file with the axes of a .ply."""
 MOST_NAMED = 8
 """Extensions that are named, of those left out."""
 SYSTEMS = [
@@ -61,6 +65,7 @@ SYSTEMS = [
 ]
 """Names of the coordinate systems 1 to 16, LDB to RBU: what x, y and z point to."""
 PLY_AXES = "RDF"
+PLY_UP: Vec3 = (0.0, -1.0, 0.0)
 TOWARDS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0)} | {
     "F": (0, 0, 1),
     "B": (0, 0, -1),
@@ -77,13 +82,24 @@ Version = Literal[3, 4]
 U8 = NDArray[np.uint8]
 
 
-def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool, version: Version = 3) -> None:
+def write_spz(
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    antialiased: bool,
+    version: Version = 3,
+    up: Vec3 = PLY_UP,
+) -> None:
     """Write ``path``, whole or not at all; raises what ``encode_spz`` raises."""
-    write_whole(path, encode_spz(gaussians, antialiased=antialiased, version=version))
+    write_whole(path, encode_spz(gaussians, antialiased=antialiased, version=version, up=up))
 
 
-def encode_spz(gaussians: Gaussians, *, antialiased: bool, version: Version = 3) -> bytes:
+def encode_spz(
+    gaussians: Gaussians, *, antialiased: bool, version: Version = 3, up: Vec3 = PLY_UP
+) -> bytes:
     """Return ``gaussians`` as a file. The same Gaussians give the same bytes.
+
+    Version 4 states ``up``, the vertical.
 
     Raises ``InvalidInput`` where a mean is farther from the origin than 24 bits of whole metres,
     ``BackendUnavailable`` for version 4 without Zstandard.
@@ -112,6 +128,8 @@ def encode_spz(gaussians: Gaussians, *, antialiased: bool, version: Version = 3)
 
     axes = struct.pack("<I", SYSTEMS.index(PLY_AXES) + 1)
     extension = RECORD.pack(COORDINATE_SYSTEM, len(axes)) + axes
+    if up != PLY_UP:
+        extension += RECORD.pack(VERTICAL, DIRECTION.size) + DIRECTION.pack(*up)
     coded = [ZstdCompressor(ZSTANDARD_LEVEL).compress(block) for block in filled]
     table = [struct.pack("<QQ", *map(len, pair)) for pair in zip(coded, filled, strict=True)]
     table_at = struct.pack("<I12x", HEADER_4_BYTES + len(extension))
@@ -325,6 +343,8 @@ def _with_ply_axes(stored: StoredSplats, extensions: dict[int, bytes]) -> Stored
     """Return the splats with the axes of a .ply, and say what was done and left out."""
     content = extensions.pop(COORDINATE_SYSTEM, b"")
     number = int.from_bytes(content, "little")
+    is_ply = number == SYSTEMS.index(PLY_AXES) + 1
+    up = _up(extensions.pop(VERTICAL, b"")) if is_ply else PLY_UP
     others = ", ".join(f"{kind:#010x}" for kind in list(extensions)[:MOST_NAMED])
     notes = (f"extensions that no field has room for are left out: {others}",) if others else ()
     if not content or number == 0:
@@ -337,9 +357,21 @@ def _with_ply_axes(stored: StoredSplats, extensions: dict[int, bytes]) -> Stored
         raise InvalidInput("axes", f"coordinate system {number}; 1 to {len(SYSTEMS)} are known")
     name = SYSTEMS[number - 1]
     said = f"axes: {name}, as the file states"
-    if name == PLY_AXES:
-        return replace(stored, notes=(said, *notes))
-    return replace(_turned(stored, name), notes=(f"{said}, turned to RDF of a .ply", *notes))
+    if is_ply:
+        return replace(stored, notes=(said, *notes), up=up)
+    notes = (f"{said}, turned to RDF of a .ply", *notes)
+    return replace(_turned(stored, name), notes=notes, up=up)
+
+
+def _up(content: bytes) -> Vec3:
+    """Return the vertical of our own record, or without one that of a .ply."""
+    if not content:
+        return PLY_UP
+    if len(content) != DIRECTION.size:
+        raise InvalidInput("up", f"{len(content)} bytes, where {DIRECTION.size} are due")
+    x, y, z = (round(value, 6) for value in DIRECTION.unpack(content))
+    check_direction("up", (x, y, z))
+    return x, y, z
 
 
 def _turned(stored: StoredSplats, system: str) -> StoredSplats:

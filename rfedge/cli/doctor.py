@@ -31,12 +31,12 @@ class Doctor:
     def run(self) -> None:
         """Print a line for each thing."""
         from rfcore.dataset.bag_file import is_bag
-        from rfcore.errors import DatasetError, InvalidInput
+        from rfcore.errors import DatasetError, InvalidData
         from rfcore.field.splat_file import looks_like_splats
         from rfcore.wire.drive_file import is_coded_drive
 
         if not self.path.exists():
-            raise InvalidInput("path", f"there is no {self.path}")
+            raise InvalidData(f"there is no {self.path}")
         try:
             if is_field_file(self.path):
                 lines = _of_field(self.path)
@@ -87,6 +87,7 @@ def _of_splats(path: Path) -> Iterator[str]:
     import numpy as np
 
     from rfedge.fields.confined_reader import read_splats
+    from rfedge.fields.describe import up_of_file
 
     read = read_splats(path)
     splats = read.splats
@@ -97,6 +98,7 @@ def _of_splats(path: Path) -> Iterator[str]:
         sides = " x ".join(f"{side:.3g}" for side in high - low)
         yield f"nine in ten lie within {sides} units"
     yield from read.notes
+    yield up_of_file(read.up)
     name = shlex.quote(path.stem.partition(".")[0] or "field")
     yield f"next: rfedge field import {shlex.quote(str(path))} --name {name}"
 

@@ -74,7 +74,7 @@ class FieldImport:
 
         from rfcore.errors import InvalidInput
         from rfcore.field import FieldMetadata, SplatField, save_field
-        from rfedge.fields.describe import print_levels, size_mb
+        from rfedge.fields.describe import print_levels, size_mb, up_of_file
         from rfedge.fields.viewpoints import UPS, look_around
 
         out = self.out if self.out is not None else IMPORTED / f"{self.name}.rff"
@@ -92,7 +92,8 @@ class FieldImport:
         out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, out)
         print(f"{out}: field {field_id}, {field.primitives:,} splats, {size_mb(field):.2f} MB")
-        for note in (*read.notes, self._mode_line(read.antialiased)):
+        up_line = up_of_file(read.up) if self.up is None else f"up: {self.up}, as --up states"
+        for note in (*read.notes, up_line, self._mode_line(read.antialiased)):
             print(note)
         print_levels(Console(), field, look_around(field, 1280, 720))
 
@@ -138,9 +139,9 @@ class FieldExport:
     """The archive (.rff), or the field's name."""
     out: Annotated[Path, arg(metavar="FILE.ply|.spz|.glb|.usdc")]
     """The file to write; positions are relative to the tile's origin. As .ply in the property order
-    of the reference implementation, with a SplatRenderMode comment that says how the splats are to
-    be drawn; as .spz, lossy and a tenth of the size, for viewers in a browser; as .glb, glTF with
-    KHR_gaussian_splatting; as .usdc or .usda, OpenUSD (extra usd)."""
+    of the reference implementation, with comments that say how the splats are to be drawn and
+    which way is up; as .spz, lossy and a tenth of the size, for viewers in a browser; as .glb, glTF
+    with KHR_gaussian_splatting; as .usdc or .usda, OpenUSD (extra usd)."""
     detail: float = 1.0
     """Share of the splats: 1, 0.5, 0.25 or 0.1."""
     spz_version: Literal[3, 4] = 4
@@ -179,12 +180,13 @@ class FieldExport:
 
         antialiased, up = metadata.antialiased, metadata.vertical
         if self.out.suffix == ".ply":
-            write_ply(self.out, splats, antialiased=antialiased)
-            return ""
+            stated = up if metadata.states_up else None
+            write_ply(self.out, splats, antialiased=antialiased, up=stated)
+            return f"the field's own; up, {direction(up)}, is a comment" if stated else ""
         if self.out.suffix == ".spz":
-            write_spz(self.out, splats, antialiased=antialiased, version=self.spz_version)
-            stated = "as it states" if self.spz_version == 4 else "which version 3 cannot state"
-            return f"RDF, those of a .ply, {stated}"
+            write_spz(self.out, splats, antialiased=antialiased, version=self.spz_version, up=up)
+            can = "as it states" if self.spz_version == 4 else "which version 3 cannot state"
+            return f"RDF, those of a .ply, and up, {direction(up)}, {can}"
         if self.out.suffix == ".glb":
             write_glb(self.out, splats, antialiased=antialiased, up=up)
             return f"the field's vertical, {direction(up)}, is +Y, as glTF says"

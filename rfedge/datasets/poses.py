@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,10 +25,11 @@ from rfcore.dataset.picture_header import picture_header
 from rfcore.dataset.read import read_dataset, read_source, refuse_video
 from rfcore.dataset.source import SourceCamera, SourcePicture, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
-from rfcore.errors import DatasetError
+from rfcore.errors import DatasetError, named
 from rfcore.extras import needs
 from rfcore.files import whole_folder
 from rfcore.image import read_rgb, write_png
+from rfcore.wire.waits import waiting
 from rfedge.datasets.colmap_features import (
     DATABASE,
     PoseSettings,
@@ -84,7 +86,8 @@ def pose_dataset(
         _write(folder, root, names, solution)
         if register_to is None:
             _check_lens(images, folder, f"{len(solution.placed)} of {len(paths)}")
-    return _summary(out, solution) + said
+    found = not settings.parameters and (not known or settings.camera == "estimate")
+    return _summary(out, solution) + (_focal_lengths(solution) if found else "") + said
 
 
 def _of_one_size(
@@ -170,6 +173,12 @@ def _summary(out: Path, solution: PlacedPictures) -> str:
     return f"{line}; not placed: {', '.join(Path(name).name for name in solution.lost)}"
 
 
+def _focal_lengths(solution: PlacedPictures) -> str:
+    cameras = dict.fromkeys(camera.intrinsics for camera, _ in solution.placed.values())
+    lengths = named((f"{k.fx_px:.0f} px ({k.width_px}x{k.height_px})" for k in cameras), "none")
+    return f"; focal length found: {lengths}"
+
+
 @dataclass(frozen=True)
 class PlacedPictures:
     """Cameras and world_from_cam by name for the pictures that were placed, and the points."""
@@ -193,18 +202,24 @@ def solve_poses(
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     origin = chosen_origin(known) if known else TileOrigin()
     if known:
-        tell(f"features of the dataset's {len(known)} pictures")
-        add_known(root, known, settings)
-    tell(f"features of {len(names)} new pictures")
-    add_new(root, names, settings)
-    tell(f"matching {len(known) + len(names)} pictures ({settings.matching})")
-    match(root, settings)
+        with _told(tell, f"features of the dataset's {len(known)} pictures"):
+            add_known(root, known, settings)
+    with _told(tell, f"features of {len(names)} new pictures"):
+        add_new(root, names, settings)
+    with _told(tell, f"matching {len(known) + len(names)} pictures ({settings.matching})"):
+        match(root, settings)
     placing = _PlacingProgress(tell, len(known) + len(names))
     if known:
         model = _registered(root, known, origin, settings, placing)
     else:
         model = _alone(root, settings, placing)
     return _solution(model, names, origin)
+
+
+def _told(tell: Tell, what: str) -> AbstractContextManager[object]:
+    """Say what begins and, as long as the block lasts, for how long it has been."""
+    tell(what)
+    return waiting(what, lambda what, since_s: tell(f"{what}: {since_s:.0f} s so far"))
 
 
 class _PlacingProgress:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from rfcore.camera import Camera
+from rfcore.camera import Camera, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, FieldMetadata, Quality, RadianceField, SplatField, render_field_view
 from rfcore.field.interface import SPLATS
@@ -148,11 +148,21 @@ def describe_field(field: RadianceField) -> list[tuple[str, str]]:
     return rows
 
 
+def up_of_file(up: Vec3 | None) -> str:
+    """Return a line about the vertical that a splat file states, None where it does not."""
+    if up is None:
+        return "up is taken to be z: the file does not state it (--up y or --up -y at import)"
+    return f"up: {direction(up)}, as the file states"
+
+
 def _up(metadata: FieldMetadata) -> str:
     """Return which way is up, and how that is known."""
     why = "as nothing else is known"
-    if metadata.states_up:
-        why = "as the training cameras show" if metadata.anchor is None else "by the anchor"
+    if metadata.anchor is not None:
+        why = "by the anchor"
+    elif metadata.up is not None:
+        trained = metadata.training_digest
+        why = "as the training cameras show" if trained else "as stated at its import"
     return f"{direction(metadata.vertical)}, {why}"
 
 

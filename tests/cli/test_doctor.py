@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfcore.errors import DatasetError, FieldFormatError, InvalidInput
+from rfcore.errors import DatasetError, FieldFormatError, InvalidData
 from rfcore.field import SplatField, save_field, write_ply
 from rfcore.field.spz import write_spz
 from rfcore.image import write_png
@@ -49,6 +49,20 @@ def test_axes_of_an_spz_are_told(tmp_path, capsys):
         assert f"axes: {said}" in told(tmp_path / "a.spz", capsys)
 
 
+def test_an_up_that_is_not_stated_is_told_and_its_remedy_states_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_ply(tmp_path / "a.ply", make_gaussians(5, 0))
+    said = told(tmp_path / "a.ply", capsys)
+    words = re.search(r"^up is taken to be z: .*\(--up y or (--up -y) at import\)$", said, re.M)[1]
+    parse(["field", "import", "a.ply", "--name", "a", *words.split()]).run()
+    assert "up: -y, as --up states" in capsys.readouterr().out
+    assert "-y, as stated at its import" in told(tmp_path / "out/fields/a.rff", capsys)
+    for name in ("b.ply", "b.spz"):
+        parse(["field", "export", "a", "--out", name]).run()
+        assert "up, -y," in capsys.readouterr().out
+        assert "up: -y, as the file states" in told(tmp_path / name, capsys)
+
+
 @pytest.mark.parametrize("form", ["transforms", "colmap_binary", "kitti"])
 def test_a_dataset_is_told_with_its_cameras(tmp_path, capsys, form):
     path = GoldenScene().write(form, tmp_path)
@@ -79,7 +93,7 @@ def test_what_cannot_be_read_is_an_error_with_what_to_do(tmp_path):
         ("scene.sog", FieldFormatError, "npx @playcanvas/splat-transform"),
         ("video.mp4", DatasetError, "rfedge dataset poses"),
         (".", DatasetError, r"it holds 1 splat files: rfedge doctor \S*scene\.sog"),
-        ("none", InvalidInput, "there is no"),
+        ("none", InvalidData, "^there is no"),
     ):
         with pytest.raises(error, match=said):
             parse(["doctor", str(tmp_path / name)]).run()

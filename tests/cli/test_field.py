@@ -158,6 +158,7 @@ def test_an_exported_spz_says_its_axes_and_comes_back(here, splats, capsys, vers
     FieldImport(here / "a.spz", "back", raw=True).run()
     back = load_field(field_path("back"))
     assert back.metadata.antialiased
+    assert back.metadata.up == (None if version == 3 else (0, 0, 1))
     order, order_back = (np.lexsort(np.round(g.means, 2).T) for g in (splats, back.gaussians))
     np.testing.assert_allclose(back.gaussians.means[order_back], splats.means[order], atol=2.0**-12)
 

@@ -292,6 +292,22 @@ def test_every_spelling_in_use_is_read_and_the_last_counts(tmp_path, comments, s
     assert read_splat_file(tmp_path / "a.ply").antialiased is stated
 
 
+@pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0), (0.1, -0.7, 0.7071)])
+def test_which_way_is_up_survives_a_ply(tmp_path, up):
+    gaussians = make_gaussians(3, 1)
+    write_ply(tmp_path / "a.ply", gaussians, up=up)
+    assert read_splat_file(tmp_path / "a.ply").up == up
+    assert_equal(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+@pytest.mark.parametrize("words", ["0 0", "0 0 up", "0 0 9", "nan 0 0", ""])
+def test_an_up_that_is_no_direction_is_refused(tmp_path, words):
+    write_ply(tmp_path / "a.ply", make_gaussians(1, 0), up=(0.0, 0.0, 1.0))
+    edited(tmp_path / "a.ply", "up: 0 0 1", f"up: {words}")
+    with pytest.raises(FieldFormatError, match="no unit vector"):
+        read_splat_file(tmp_path / "a.ply")
+
+
 def test_a_mode_there_is_not_is_refused_by_name(tmp_path):
     write_ply(tmp_path / "a.ply", make_gaussians(1, 0), antialiased=True)
     edited(tmp_path / "a.ply", "SplatRenderMode: mip", "SplatRenderMode: 2dgs")

@@ -18,7 +18,7 @@ from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field.similarity import spherical_harmonics
 from rfcore.field.splat_file import read_open_splat_file
-from rfcore.field.spz import COORDINATE_SYSTEM, SYSTEMS, encode_spz
+from rfcore.field.spz import COORDINATE_SYSTEM, SYSTEMS, VERTICAL, encode_spz
 from rfcore.field.stored_splats import ImportedSplats
 from rfcore.raster.gaussians import Gaussians
 
@@ -229,6 +229,22 @@ def test_both_versions_that_are_written_hold_the_same_and_the_fourth_states_its_
     assert read[1].notes == ("axes: RDF, as the file states",)
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8)])
+def test_version_4_states_the_vertical(up):
+    given_ = random_gaussians(6, 20, 1, 9.0)
+    read = imported(encode_spz(given_, antialiased=False, version=4, up=up))
+    assert read.up == up
+    assert_same(read.splats, imported(encode_spz(given_, antialiased=False)).splats)
+    assert imported(encode_spz(given_, antialiased=False, up=up)).up is None
+
+
+@pytest.mark.parametrize("record", [bytes(11), struct.pack("<fff", 0, 0, 9), bytes(12)])
+def test_a_vertical_that_is_no_direction_is_refused(record):
+    data = encode_spz(random_gaussians(6, 20, 1, 9.0), antialiased=False)
+    with pytest.raises(FieldFormatError, match="up"):
+        imported(with_extensions(data, axes(6), (VERTICAL, record)))
+
+
 def test_no_splats_are_a_file_of_version_4_too():
     data = encode_spz(random_gaussians(1, 0, 2, 1.0), antialiased=False, version=4)
     assert decoded(data)[0].sh.shape == (0, 9, 3)
@@ -293,6 +309,7 @@ def test_axes_that_are_stated_are_obeyed(name):
     for got, want in zip(looks(read.splats, np.eye(3)), looks(stored, ply_from_file), strict=True):
         np.testing.assert_allclose(got, want, atol=1e-4 * np.abs(want).max())
     assert f"axes: {name}, as the file states" in read.notes[0]
+    assert read.up == (0.0, -1.0, 0.0)
 
 
 def test_lichtfelds_layout_is_turned_back():

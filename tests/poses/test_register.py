@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from itertools import pairwise
 from pathlib import Path
 
@@ -70,6 +71,7 @@ def test_half_of_a_drive_is_placed_among_the_other_half(drive, tmp_path):
     known, new = half_of(drive, tmp_path / "known"), others_of(drive, tmp_path / "new")
     told: list[str] = []
     line = pose_dataset(new, tmp_path / "out", known, SETTINGS, told.append)
+    told = [text for text in told if not text.endswith("so far")]
     assert told[:4] == [
         "features of the dataset's 4 pictures",
         "features of 4 new pictures",
@@ -192,6 +194,39 @@ def test_pictures_of_another_size_than_the_given_camera_are_named(tmp_path, monk
         (pictures / f"{i}.png").rename(few / f"{i}.png")
     with pytest.raises(DatasetError, match="2 pictures are left of 3"):
         pose_dataset(few, tmp_path / "other", None, given, lambda _: None)
+
+
+def test_the_focal_lengths_that_were_found_are_said(tmp_path, monkeypatch):
+    def solved(_root, names, *_rest):
+        wide, narrow = (
+            SourceCamera(Intrinsics(side, side, f_px, f_px, side / 2, side / 2))
+            for side, f_px in ((64, 50.2), (32, 25.7))
+        )
+        points = SourcePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        placed = {n: (narrow if n[4] in "13" else wide, Pose.identity()) for n in names}
+        return PlacedPictures(placed, (), points)
+
+    monkeypatch.setattr(poses, "solve_poses", solved)
+    pictures = two_sizes(tmp_path / "two")
+    line = pose_dataset(pictures, tmp_path / "out", None, SETTINGS, lambda _: None)
+    assert line.endswith("focal length found: 50 px (64x64), 26 px (32x32)")
+
+
+def test_how_long_matching_has_been_going_on_is_told(tmp_path, monkeypatch):
+    said_again = threading.Event()
+
+    def tell(text: str) -> None:
+        if re.fullmatch(r"matching 2 pictures \(exhaustive\): \d+ s so far", text):
+            said_again.set()
+
+    def match(*_) -> None:
+        assert said_again.wait(60)
+        raise DatasetError("no more of it")
+
+    monkeypatch.setattr(poses, "add_new", lambda *_: None)
+    monkeypatch.setattr(poses, "match", match)
+    with pytest.raises(DatasetError, match="no more of it"):
+        poses.solve_poses(tmp_path, ["new/0.png", "new/1.png"], (), SETTINGS, tell)
 
 
 def test_each_size_gets_a_camera_of_its_own_where_none_is_given(tmp_path):

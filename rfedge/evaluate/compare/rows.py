@@ -117,9 +117,9 @@ class BreakEvenRow:
     scene: str
     hz: float
     method: str
-    rival: str
+    rival: str = field(metadata=shown("against"))
     """The setting that the field is paid for against."""
-    at_db: float
+    at_db: float = field(metadata=shown("at dB", "g"))
     """Luma PSNR that bytes are compared at: 33 dB, or the lowest above it that both curves have."""
     frames_per_pass: int
     """Frames of the drive, the first among them."""
@@ -364,6 +364,7 @@ METHOD = Column("method", lambda row: without_field(row.method))
 _BREAK_EVEN = [
     DRIVE,
     Column("field", _field),
+    *columns(BreakEvenRow, "rival", "at_db"),
     Column("saved kB a pass", lambda row: row.saved_bytes_per_pass / 1e3, ".1f"),
     Column("field MB", lambda row: row.field_bytes / 1e6, ".2f"),
     *columns(BreakEvenRow, "passes_to_break_even"),
