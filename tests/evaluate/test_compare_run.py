@@ -234,7 +234,7 @@ def test_a_quick_comparison_says_so_in_each_table_and_has_a_line_for_a_rival(com
 
 def test_what_a_fields_own_bytes_leave_names_the_rival_and_the_quality(compared_quickly):
     _, result, _, _ = compared_quickly
-    (table,) = (part for part in compare_parts(result) if "own bytes" in getattr(part, "title", ""))
+    (table,) = (part for part in compare_parts(result) if "own bytes" in str(part))
     (row, *_) = result["break_even"]
     cells = {column.text(table.rows[0]) for column in table.columns}
     assert cells >= {row["rival"], f"{row['at_db']:g}"}
