@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from math import log10
 from statistics import median
 from typing import Any, TextIO
 
@@ -23,6 +22,7 @@ from cav_agent.metrics import AgentMetrics
 from cav_agent.pose_feed.fix import FeedProblem
 from rfcore.field import RadianceField
 from rfcore.localise.estimate import LocalisationState, PoseEstimate
+from rfcore.metrics import psnr_of_mse
 from rfcore.wire.address import Address
 from rfcore.wire.notices import StreetNotice
 from rfcore.wire.values import ClockKind
@@ -353,7 +353,7 @@ def _coding_of(result: FrameResult) -> dict[str, Any]:
 
 
 def _psnr_db(luma_mse: float) -> float:
-    return round(10 * log10(255**2 / luma_mse), 2)
+    return round(psnr_of_mse(luma_mse), 2)
 
 
 def _pose_of(fix: PoseEstimate) -> dict[str, Any]:

@@ -60,7 +60,7 @@ IDR, SLICES = 5, (1, 5)
 
 @dataclass(frozen=True)
 class Asked:
-    """What is read: ``files`` are descriptors and names, in order; ``None`` are all topics.
+    """A request: ``files`` are descriptors and names, in order; ``None`` are all topics.
 
     ``data``: the pictures' bytes, too. ``follow``: wait at the end for what is written next.
     """
@@ -351,7 +351,7 @@ KINDS: dict[str, tuple[str, Callable[[Any], tuple[Head, bytes]]]] = {
     "foxglove.FrameTransforms": ("transforms", _transforms),
     "foxglove.LocationFix": ("fix", _fix),
 }
-"""What is understood: the kind of record, and how it is made of the message."""
+"""Messages that are understood: the kind of record, and how it is made of the message."""
 PICTURES = ("image", "still", "video")
 
 

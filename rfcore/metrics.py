@@ -83,7 +83,12 @@ def psnr(a: Picture, b: Picture, peak: float | None = None, mask: Mask | None = 
         a, b = a[mask][None], b[mask][None]
     error = mean_squared_error(a, b)
     top = _resolve_peak(a, peak)
-    return math.inf if error == 0.0 else 10.0 * math.log10(top * top / error)
+    return psnr_of_mse(error, top)
+
+
+def psnr_of_mse(mse: float, peak: float = UINT8_PEAK) -> float:
+    """Return the PSNR in dB of a mean squared error; infinite for 0."""
+    return math.inf if mse == 0.0 else 10.0 * math.log10(peak * peak / mse)
 
 
 def ssim(a: Picture, b: Picture, peak: float | None = None, mask: Mask | None = None) -> float:

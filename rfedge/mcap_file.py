@@ -26,17 +26,15 @@ from typing import Any
 import av
 import numpy as np
 from av.video.codeccontext import VideoCodecContext
-from av.video.reformatter import ColorRange
 
 from rfcore.camera import Intrinsics, Pose, Vec3
-from rfcore.codec.h264.ffmpeg import SIGNAL
 from rfcore.extras import needs
 from rfcore.field import RadianceField, SplatField
 from rfcore.harmonics import SH_DC
 from rfcore.image import I420, rgb_from_colour
 from rfcore.perception.objects import StreetObject
 from rfcore.vertical import Z_UP, upright_from
-from rfedge.video import BT709, even_frame
+from rfedge.video import X264_SIGNAL, even_frame, tag_as_bt709
 
 with needs("bags"):
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -107,17 +105,15 @@ class VideoEncoder:
         assert isinstance(context, VideoCodecContext)
         context.width, context.height = (side // 2 * 2 for side in size_px)
         context.thread_count = 1  # more would hold pictures back
-        context.pix_fmt, context.time_base = "yuv420p", Fraction(1, KEY_EVERY)
-        context.color_range = ColorRange.MPEG
-        context.colorspace = context.color_primaries = context.color_trc = BT709
-        signal = ":".join(f"{name}={value}" for name, value in SIGNAL.items())
+        context.time_base = Fraction(1, KEY_EVERY)
+        tag_as_bt709(context)
         context.options = {
             "crf": CRF,
             "preset": "veryfast",
             "tune": "zerolatency",
             "bf": "0",
             "g": str(KEY_EVERY),
-            "x264-params": f"{signal}:repeat-headers=1:sliced-threads=0",
+            "x264-params": f"{X264_SIGNAL}:repeat-headers=1:sliced-threads=0",
         }
         self._context, self._count = context, 0
 

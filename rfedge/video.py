@@ -8,6 +8,7 @@ from pathlib import Path
 
 import av
 from av.container import OutputContainer
+from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import ColorRange
 from av.video.stream import VideoStream
 
@@ -18,6 +19,8 @@ from rfcore.native.yuv import i420_from_rgb
 
 BT709 = 1
 """The code of ITU-T H.273 for primaries, transfer and matrix."""
+X264_SIGNAL = ":".join(f"{name}={value}" for name, value in SIGNAL.items())
+"""x264's parameters that say the same."""
 
 
 def write_mp4(path: Path, frames: Iterable[Rgb | I420], rate_hz: float) -> int:
@@ -56,11 +59,14 @@ def bt709_stream(
     container: OutputContainer, rate_hz: Fraction | None, options: dict[str, str]
 ) -> VideoStream:
     """Add a stream of H.264 that is tagged as BT.709 in limited range, which ``I420`` is."""
-    signal = ":".join(f"{name}={value}" for name, value in SIGNAL.items())
-    options = {**options, "x264-params": signal}
+    options = {**options, "x264-params": X264_SIGNAL}
     stream = container.add_stream("libx264", rate=rate_hz, options=options)
-    stream.pix_fmt = "yuv420p"
-    codec = stream.codec_context
+    tag_as_bt709(stream.codec_context)
+    return stream
+
+
+def tag_as_bt709(codec: VideoCodecContext) -> None:
+    """Have a coder take the pictures of ``I420``, and say what they are; with ``X264_SIGNAL``."""
+    codec.pix_fmt = "yuv420p"
     codec.color_range = ColorRange.MPEG
     codec.colorspace = codec.color_primaries = codec.color_trc = BT709
-    return stream

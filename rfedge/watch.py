@@ -19,6 +19,7 @@ from concurrent.futures import Future, wait
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
@@ -206,15 +207,6 @@ ObjectsOf = Callable[[ObjectsRequest], Iterator[ObjectsSeen]]
 """Yields a server's objects on the ground of one field."""
 
 
-@dataclass(frozen=True)
-class Watched:
-    """What is watched: pictures and, if they are there, objects; the field as an MCAP shows it."""
-
-    pictures: PictureSource
-    objects: ObjectsOf | None = None
-    field: RadianceField | None = None
-
-
 class TwinMcap:
     """Keeps pictures and objects in an MCAP file (``rfedge.mcap_file``)."""
 
@@ -253,30 +245,36 @@ class TwinMcap:
 
 
 @contextmanager
-def _opened_mcap(path: Path, watched: Watched) -> Iterator[TwinMcap]:
+def _opened_mcap(
+    path: Path, objects: ObjectsOf | None, field: RadianceField | None
+) -> Iterator[TwinMcap]:
     from rfedge.mcap_file import McapFile
 
-    with McapFile(path, watched.field) as file:
-        yield TwinMcap(file, watched.objects)
+    with McapFile(path, field) as file:
+        yield TwinMcap(file, objects)
     if file.late:
         _say(f"{path}: {file.late} pictures left out, not taken later than the ones before them")
 
 
-def watch(settings: WatchSettings, source: PictureSource | Watched) -> None:
+def watch(
+    settings: WatchSettings,
+    source: PictureSource,
+    objects: ObjectsOf | None = None,
+    field: RadianceField | None = None,
+) -> None:
     """Print and keep what ``source`` shows, until it ends, is stopped, or enough was seen.
 
+    An MCAP file has ``objects``, too, and shows ``field`` as points.
     Files are whole when it returns or raises. Raises ``RfedgeError`` if the source is not there or
     refuses.
     """
     pictures = 0
-    watched = source if isinstance(source, Watched) else Watched(source)
-    source = watched.pictures
     with ExitStack() as stack:
         folder = PictureFolder(settings.folder) if settings.folder else None
         video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
         mcap = None
         if settings.mcap is not None:
-            mcap = stack.enter_context(_opened_mcap(settings.mcap, watched))
+            mcap = stack.enter_context(_opened_mcap(settings.mcap, objects, field))
         wait_for = stack.enter_context(waiting("a connection", _say_wait))
 
         def connected(may_see: str) -> None:
@@ -311,7 +309,12 @@ def _say_wait(what: str, waited_s: float) -> None:
     _say(f"waiting for {what} for {waited_s:.0f} s")
 
 
-def watch_until_stopped(settings: WatchSettings, source: PictureSource | Watched) -> None:
+def watch_until_stopped(
+    settings: WatchSettings,
+    source: PictureSource,
+    objects: ObjectsOf | None = None,
+    field: RadianceField | None = None,
+) -> None:
     """Watch to the end, or until SIGINT or SIGTERM; to be called from the main thread.
 
     After the first signal files are completed. If that takes longer than ``FINISH_S``, because
@@ -325,10 +328,10 @@ def watch_until_stopped(settings: WatchSettings, source: PictureSource | Watched
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        ended = _started(settings, source)
+        ended = _started(partial(watch, settings, source, objects, field))
         while not ended.done() and not signals:
             wait([ended], timeout=LOOK_EVERY_S)
-        (source.pictures if isinstance(source, Watched) else source).stop()
+        source.stop()
         finish_until_s = time.monotonic() + FINISH_S
         while not ended.done():
             if len(signals) > 1 or time.monotonic() > finish_until_s:
@@ -341,13 +344,13 @@ def watch_until_stopped(settings: WatchSettings, source: PictureSource | Watched
     ended.result()
 
 
-def _started(settings: WatchSettings, source: PictureSource | Watched) -> Future[None]:
+def _started(watching: Callable[[], None]) -> Future[None]:
     """Watch on a thread of its own; return its outcome."""
     ended = Future[None]()
 
     def run() -> None:
         try:
-            watch(settings, source)
+            watching()
         except BaseException as error:
             ended.set_exception(error)
         else:

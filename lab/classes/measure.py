@@ -25,6 +25,7 @@ from lab.report import Report, bars
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
 from rfcore.image import I420
+from rfcore.metrics import psnr_of_mse
 from rfedge.evaluate.clips import (
     QUICK,
     STEADY,
@@ -34,7 +35,6 @@ from rfedge.evaluate.clips import (
     DriveName,
     DriveOfField,
     Notes,
-    psnr_of_mse,
 )
 from rfedge.evaluate.field_coder import FieldCoder, render_clip
 from rfedge.evaluate.noted_coder import NotedCoder, PictureCoder

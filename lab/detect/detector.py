@@ -62,7 +62,7 @@ class DetectorFailed(InvalidData):
 
 
 class Adapter(Protocol):
-    """What is known of one kind of network."""
+    """One kind of network: its input and its output."""
 
     input_px: int
     """Side of its square input."""
@@ -137,11 +137,12 @@ class Detector:
 
     def boxes(self, picture: Rgb) -> list[Box]:
         """Return what is in a picture, surest first; raise ``DetectorFailed``."""
-        seen = [self._tile_boxes(picture[rows, columns]) for rows, columns in tiles(picture)]
+        places = tiles(picture)
+        seen = [self._tile_boxes(picture[rows, columns]) for rows, columns in places]
         boxes = np.concatenate(
             [
                 each[0] + (columns.start, rows.start, 0, 0)
-                for each, (rows, columns) in zip(seen, tiles(picture), strict=True)
+                for each, (rows, columns) in zip(seen, places, strict=True)
             ]
         )
         scores, classes = (np.concatenate([each[k] for each in seen]) for k in (1, 2))

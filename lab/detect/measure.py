@@ -145,7 +145,7 @@ def _boxes_of_labels(labels: NDArray[np.uint8]) -> Iterator[Box]:
 
 @dataclass(frozen=True)
 class DetectRow:
-    """What a detector sees of one class and size in the pictures of one method, at the bits that
+    """Average precision of one class and size in the pictures of one method, at the bits that
     ours needs for ``at_db``."""
 
     drive: str = field(metadata=shown("drive"))
@@ -177,7 +177,7 @@ class DetectBdRow:
 
 @dataclass(frozen=True)
 class CostRow:
-    """What the detector and the masks cost on one drive."""
+    """Time that the detector and the masks take on one drive."""
 
     drive: str = field(metadata=shown("drive"))
     frames: int = field(metadata=shown("frames", "d"))
@@ -250,19 +250,14 @@ def read_detection(job: EvalDetect, given: DriveOfField, noted: DetectedBoxes) -
     if street is not None:
         truths["street"] = street
     failed = [k for k, boxes in enumerate(seen) if boxes is None]
+    name = f"{given.name.scene}@{given.name.rate_hz:g}"
     return DriveDetection(
-        f"{given.name.scene}@{given.name.rate_hz:g}",
+        name,
         drive.clip(),
         {name: NotedCoder(coder, noted) for name, coder in coders.items()},
         truths,
         failed,
-        CostRow(
-            f"{given.name.scene}@{given.name.rate_hz:g}",
-            len(frames),
-            len(failed),
-            detector_ms,
-            mask_ms,
-        ),
+        CostRow(name, len(frames), len(failed), detector_ms, mask_ms),
     )
 
 

@@ -23,9 +23,10 @@ from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, render_field_view
 from rfcore.localise.estimate import LocalisationState
+from rfcore.metrics import psnr_of_mse
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
-from rfedge.evaluate.clips import luma_mse, psnr_of_mse
+from rfedge.evaluate.clips import luma_mse
 from rfedge.located import LocatedDrive, Observation, TimedFix, times_of
 from rfedge.offline import FrameInput, encode_frames
 

@@ -26,7 +26,7 @@ from typing import Protocol
 
 import av
 
-from rfcore.bag_reader import PICTURES, Head
+from rfcore.bag_reader import NS, PICTURES, Head
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.bag_records import PictureDecoder, at_s, bag_records, check_encoding
 from rfcore.dataset.bag_transforms import STEP_NS, FrameTree
@@ -35,7 +35,6 @@ from rfcore.dataset.source import Source, SourceCamera, SourcePicture
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, rgb_from_video_frame
 
-NS = 1_000_000_000
 MAX_GAP_NS = NS
 LENSES = {
     "": ("PINHOLE", ()),
@@ -131,7 +130,7 @@ class BagIndex:
 
 @dataclass(frozen=True)
 class BagChoice:
-    """What a camera.toml says of a bag: ``topics`` that are meant, and what stands in for its own
+    """A camera.toml's choice in a bag: ``topics`` that are meant, and what stands in for its own
     camera and mounting."""
 
     topics: tuple[str, ...] = ()

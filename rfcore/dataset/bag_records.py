@@ -22,13 +22,12 @@ from av.error import FFmpegError
 from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import Colorspace
 
-from rfcore.bag_reader import LENGTH, PICTURES, Asked, Head
+from rfcore.bag_reader import LENGTH, NS, PICTURES, Asked, Head
 from rfcore.confinement.start import confined_reader
 from rfcore.dataset.bag_file import bag_files, refuse_other_bags
 from rfcore.errors import BackendUnavailable, DatasetError
 from rfcore.image import MAX_PICTURE_BYTES, MAX_PICTURE_PX, frame_from_bytes
 
-NS = 1_000_000_000
 MAX_LINE_BYTES = 1 << 24
 
 

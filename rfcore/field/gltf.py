@@ -31,7 +31,7 @@ from rfcore.camera import Pose, Vec3
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field.similarity import Similarity, moved, turned_rotations, turned_sh
 from rfcore.field.splat_archive import check_decoded_size
-from rfcore.field.stored_splats import F64, MOST_DEGREE, StoredSplats
+from rfcore.field.stored_splats import F64, MOST_DEGREE, StoredSplats, linear_parts
 from rfcore.files import write_whole
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.vertical import upright_from
@@ -72,13 +72,12 @@ def encode_glb(gaussians: Gaussians, *, antialiased: bool, up: Vec3) -> bytes:
     is_ply = np.allclose(up, (0, -1, 0), atol=1e-6)
     gltf_from_field = PLY_FROM_GLTF if is_ply else GLTF_FROM_ENU.compose(upright_from(up))
     turned = moved(gaussians, Similarity(gltf_from_field))
-    turns = turned.quaternions.astype(np.float64)
-    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    xyzw, scales, opacities = linear_parts(turned)
     arrays: dict[str, NDArray[np.floating]] = {
         "POSITION": turned.means,
-        f"{EXTENSION}:ROTATION": np.roll(turns, -1, axis=1),
-        f"{EXTENSION}:SCALE": np.exp(turned.log_scales.astype(np.float64)),
-        f"{EXTENSION}:OPACITY": 1 / (1 + np.exp(-turned.opacity_logits.astype(np.float64))),
+        f"{EXTENSION}:ROTATION": xyzw,
+        f"{EXTENSION}:SCALE": scales,
+        f"{EXTENSION}:OPACITY": opacities,
     }
     for degree in range(turned.sh_degree + 1):
         for order in range(2 * degree + 1):
@@ -130,11 +129,8 @@ def read_open_gltf(path: Path, file: BinaryIO, max_bytes: int) -> StoredSplats:
     splats that take more than ``max_bytes`` of memory.
     """
     try:
-        asset = _asset(file)
-        return _splats(asset, max_bytes)
-    except InvalidInput as error:
-        raise FieldFormatError(f"{path}: {error}") from error
-    except FieldFormatError as error:
+        return _splats(_asset(file), max_bytes)
+    except (InvalidInput, FieldFormatError) as error:
         raise FieldFormatError(f"{path}: {error}") from error
     except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
         problem = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -108,6 +108,15 @@ def finite_logits(shares: F64) -> F64:
     return np.asarray(np.log(inner / (1.0 - inner)))
 
 
+def linear_parts(gaussians: Gaussians) -> tuple[F64, F64, F64]:
+    """Return rotations [N, 4] as unit x, y, z, w, scales [N, 3] and opacities [N], as formats store
+    them that take no logarithms."""
+    xyzw = np.roll(gaussians.quaternions.astype(np.float64), -1, axis=1)
+    xyzw /= np.linalg.norm(xyzw, axis=1, keepdims=True)
+    scales = np.exp(gaussians.log_scales.astype(np.float64))
+    return xyzw, scales, 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+
+
 def middle_of(means_m: F64) -> F64:
     """Return the median [3] of the means that are finite, zero where none is."""
     finite = means_m[np.isfinite(means_m).all(axis=1)]

@@ -15,6 +15,7 @@ import numpy as np
 from rfcore.camera import Vec3
 from rfcore.extras import needs
 from rfcore.field.similarity import Similarity, moved
+from rfcore.field.stored_splats import linear_parts
 from rfcore.files import write_whole
 from rfcore.raster.gaussians import Gaussians
 from rfcore.vertical import Z_UP, upright_from
@@ -39,16 +40,13 @@ def write_usd(path: Path, gaussians: Gaussians, *, up: Vec3) -> None:
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, PRIM).GetPrim()
     stage.SetDefaultPrim(prim)
-    scales = np.exp(gaussians.log_scales.astype(np.float64))
-    opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    turns = gaussians.quaternions.astype(np.float64)
-    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    xyzw, scales, opacities = linear_parts(gaussians)
     reach = CUTOFF * scales.max(axis=1, keepdims=True)
     extent = [(gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)]
     vectors, quaternions = Vt.Vec3fArray.FromNumpy, Vt.QuatfArray.FromNumpy
     for name, value in (
         ("positions", vectors(gaussians.means)),
-        ("orientations", quaternions(np.roll(turns, -1, axis=1).astype(np.float32))),
+        ("orientations", quaternions(xyzw.astype(np.float32))),
         ("scales", vectors(scales.astype(np.float32))),
         ("opacities", Vt.FloatArray.FromNumpy(opacities.astype(np.float32))),
         ("extent", vectors(np.array(extent, np.float32))),

@@ -156,14 +156,14 @@ class _Quality:
     @property
     def psnr_db(self) -> float:
         """PSNR of the mean squared error of all pictures."""
-        from rfedge.evaluate.clips import psnr_of_mse
+        from rfcore.metrics import psnr_of_mse
 
         return psnr_of_mse(sum(self._mse) / len(self._mse))
 
     @property
     def worst(self) -> tuple[float, int]:
         """PSNR and index of the worst picture."""
-        from rfedge.evaluate.clips import psnr_of_mse
+        from rfcore.metrics import psnr_of_mse
 
         worst = max(range(len(self._mse)), key=self._mse.__getitem__)
         return psnr_of_mse(self._mse[worst]), worst

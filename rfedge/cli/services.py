@@ -39,7 +39,7 @@ class Watch:
         """Watch until the server ends the stream, enough was seen, SIGINT or SIGTERM."""
         from rfcore.errors import InvalidInput
         from rfcore.extras import require
-        from rfedge.watch import Watched, WatchSettings, watch_until_stopped
+        from rfedge.watch import WatchSettings, watch_until_stopped
 
         if self.field is not None and self.mcap is None:
             raise InvalidInput("field", "belongs to --mcap, whose points it becomes")
@@ -61,13 +61,13 @@ class Watch:
             from rfedge.twin.nats_source import NatsPictures
 
             pictures = NatsPictures(self.connection.nats_servers(urls))
-            watch_until_stopped(settings, Watched(pictures, field=field))
+            watch_until_stopped(settings, pictures, field=field)
             return
         from rfcore.wire.twin_client import TwinClient
 
         tls, allow_insecure = self.connection.tls(), self.connection.allow_insecure
         with TwinClient(self.address or "", tls, allow_insecure=allow_insecure) as client:
-            watch_until_stopped(settings, Watched(client, client.objects, field))
+            watch_until_stopped(settings, client, client.objects, field)
 
 
 @dataclass(frozen=True)

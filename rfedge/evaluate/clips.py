@@ -23,6 +23,7 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.image import I420
+from rfcore.metrics import psnr_of_mse
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
 from rfedge.arguments import open_drive, open_field
@@ -116,11 +117,6 @@ class BoundCoder(Protocol):
 
     def of_run(self, run: slice) -> ClipCoder:
         """Return the coder of the frames ``run`` alone."""
-
-
-def psnr_of_mse(mse: float) -> float:
-    """Return the PSNR in dB of a mean squared error of 8-bit samples; infinite for 0."""
-    return 10 * math.log10(PEAK * PEAK / mse) if mse else math.inf
 
 
 def luma_mse(decoded: I420, frame: I420) -> float:

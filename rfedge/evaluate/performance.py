@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.clips import STEADY, Clip, ClipCoder, CodedClip, psnr_of_mse
+from rfcore.metrics import psnr_of_mse
+from rfedge.evaluate.clips import STEADY, Clip, ClipCoder, CodedClip
 from rfedge.evaluate.rate_curve import MIN_POINTS, RateCurve, Window, rate_curve
 from rfedge.evaluate.runner import clip_key, coded_clip
 from rfedge.jobs import CellKey, CellStore, Rows

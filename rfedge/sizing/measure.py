@@ -20,8 +20,9 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
+from rfcore.metrics import psnr_of_mse
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.evaluate.clips import STEADY, Clip, CodedClip, Drive, DriveName, psnr_of_mse
+from rfedge.evaluate.clips import STEADY, Clip, CodedClip, Drive, DriveName
 from rfedge.evaluate.field_coder import FieldCoder, RenderedClip, render_clip
 from rfedge.evaluate.rivals import Rival, svtav1_lowdelay, x264_for_psnr, x265_for_psnr
 from rfedge.evaluate.runner import clip_key, coded_clip, program_version

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.metrics import psnr_of_mse
 from rfedge.evaluate.clips import (
     ONE_RUN,
     QUICK,
@@ -20,7 +21,6 @@ from rfedge.evaluate.clips import (
     Runs,
     luma_mse,
     luma_sse,
-    psnr_of_mse,
     read_drive,
 )
 

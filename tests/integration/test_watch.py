@@ -38,7 +38,7 @@ from rfcore.wire.twin_render import (
     view_request_to_wire,
 )
 from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
-from rfedge.watch import Watched, WatchSettings, watch
+from rfedge.watch import WatchSettings, watch
 
 CAMERA = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 
@@ -209,8 +209,7 @@ def watch_command() -> Callable[..., Awaitable[list[str]]]:
 
     async def run(address: object, **settings: Any) -> None:
         with TwinClient(str(address)) as client:
-            watched = Watched(client, client.objects)
-            await asyncio.to_thread(watch, WatchSettings(**settings), watched)
+            await asyncio.to_thread(watch, WatchSettings(**settings), client, client.objects)
 
     return run
 

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.clips import STEADY, Clip, CodedClip, luma_sse, psnr_of_mse
+from rfcore.metrics import psnr_of_mse
+from rfedge.evaluate.clips import STEADY, Clip, CodedClip, luma_sse
 from rfedge.evaluate.compare.rows import ForegroundRow
 from rfedge.evaluate.rate_curve import RateCurve, bd_rate_percent
 from rfedge.evaluate.rivals import Rival, x264_for_psnr

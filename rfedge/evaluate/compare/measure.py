@@ -16,7 +16,8 @@ from itertools import chain
 import numpy as np
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.clips import STEADY, Clip, CodedClip, psnr_of_mse
+from rfcore.metrics import psnr_of_mse
+from rfedge.evaluate.clips import STEADY, Clip, CodedClip
 from rfedge.evaluate.compare.rows import (
     BEST,
     BEST_OF_ANY_CPU,

@@ -34,10 +34,10 @@ from rfcore.field import Quality, RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.localise.matching import Pyramid
 from rfcore.localise.track import Track, TrackingBudget, begin_track, follow_track
-from rfcore.metrics import ssim
+from rfcore.metrics import psnr_of_mse, ssim
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView
-from rfedge.evaluate.clips import Drive, luma_mse, psnr_of_mse
+from rfedge.evaluate.clips import Drive, luma_mse
 from rfedge.evaluate.field_coder import MessageWriter
 from rfedge.offline import CodedFrame, FrameInput, decode_promised, encode_frames
 

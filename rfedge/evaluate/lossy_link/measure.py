@@ -31,6 +31,7 @@ from rfcore.field import Renderer, load_field
 from rfcore.link.lossy import LossyLink, PacketLoss
 from rfcore.link.plan import DirectionPlan, LinkPlan
 from rfcore.link.shaper import Connection, LinkProfile
+from rfcore.metrics import psnr_of_mse
 from rfcore.views import PosedPicture
 from rfcore.wire.messages import (
     OUR_CONTRACT,
@@ -42,7 +43,7 @@ from rfcore.wire.messages import (
     StageTimes,
     Welcome,
 )
-from rfedge.evaluate.clips import Drive, luma_mse, psnr_of_mse, read_drive
+from rfedge.evaluate.clips import Drive, luma_mse, read_drive
 from rfedge.evaluate.field_coder import RenderedClip, render_clip
 from rfedge.evaluate.lossy_link import EvalLossyLink
 from rfedge.evaluate.runner import Run, program_version
