@@ -38,7 +38,7 @@ from rfcore.codec.sender.ladder import MeasuredRung, Rung, read_ladder
 from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
 from rfcore.field import FULL, FieldStore, RadianceField
 from rfcore.field.own import OwnField
-from rfcore.field.place import check_place
+from rfcore.field.place import check_place, coarseness
 from rfcore.field.store import decode_beginning
 from rfcore.wire.tiles import Tile
 
@@ -311,6 +311,9 @@ class FieldCache:
         origin = field.metadata.tile_origin
         pictures = self._live or recorded_cameras(config, origin, self._instants)
         cameras = tuple(_prepared_camera(config, camera) for camera in pictures.cameras)
+        problem = coarseness(field, [camera.intrinsics for camera in pictures.cameras])
+        if problem is not None:
+            log.warning("field coarser than the camera", problem=problem)
         ladder = self._ladder(field)
         rungs = self._rungs(ladder)
         _prepare_renderers(field, ladder)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 
 from rfcore.errors import InvalidInput
 
@@ -293,6 +294,11 @@ def camera_on_rig(world_from_rig: Pose, camera_from_rig: Pose) -> Pose:
 def _normalised(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     norm = math.sqrt(sum(v * v for v in q))
     return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+def median_focal_px(intrinsics: Sequence[Intrinsics]) -> float:
+    """Return the median horizontal focal length of one camera or more, to 0.01 px."""
+    return round(median(k.fx_px for k in intrinsics), 2)
 
 
 def _check_rotation(m: list[list[float]]) -> None:

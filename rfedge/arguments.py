@@ -114,15 +114,19 @@ def open_drive(
     it does not show what the pictures do; raises ``InvalidInput`` where it is far from them all.
     """
     from rfcore.dataset import Distortion, read_dataset
-    from rfcore.field.place import check_place
+    from rfcore.field.place import check_place, coarseness
 
     origin = field.metadata.tile_origin if field is not None else None
     dataset = read_dataset(path, tile_origin=origin, distortion=Distortion.UNDISTORT)
     for change in dataset.changes:
         print(f"{path}: {change}", file=sys.stderr)
     if field is not None and field_name is not None:
-        warning = check_place(field, dataset.pictures, (field_name, str(path)))
-        if warning:
+        cameras = [picture.camera.intrinsics for picture in dataset.pictures]
+        warnings = [
+            check_place(field, dataset.pictures, (field_name, str(path))),
+            coarseness(field, cameras),
+        ]
+        for warning in filter(None, warnings):
             print(f"warning: {warning}", file=sys.stderr)
     return dataset
 

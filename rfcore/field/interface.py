@@ -32,7 +32,7 @@ SPLATS = "splats"
 NGP = "ngp"
 """Multiresolution hash grid with a small network (Mueller et al. 2022)."""
 KINDS = (SPLATS, NGP)
-LATER_KEYS = ("anchor", "up", "sights")
+LATER_KEYS = ("anchor", "up", "sights", "focal_px")
 """Keys of a header that are left out where nothing is known."""
 LAYER, DELTA = "layer", "delta"
 """Archives that need the splats of their base: ``rfcore.field.layer`` and
@@ -74,7 +74,8 @@ class FieldMetadata:
     trained to be drawn with an opacity that compensates the screen-space blur. ``anchor``: where on
     the Earth the field's axes are, ``None`` if that was not stated. ``up``: the vertical as the
     training cameras show it, ``None`` if they were not asked or do not agree; ``sights``: where
-    some of them stood.
+    some of them stood; ``focal_px``: the median focal length of the training pictures, ``None`` if
+    it is not known.
     """
 
     name: str = ""
@@ -87,8 +88,11 @@ class FieldMetadata:
     anchor: Anchor | None = None
     up: Vec3 | None = None
     sights: tuple[Sight, ...] = ()
+    focal_px: float | None = None
 
     def __post_init__(self) -> None:
+        if self.focal_px is not None and not 0 < self.focal_px < math.inf:
+            raise InvalidInput("field.focal_px", f"{self.focal_px} must be positive and finite")
         if self.up is not None:
             check_direction("field.up", self.up)
         if len(self.sights) > MOST_SIGHTS:
@@ -216,6 +220,8 @@ def stored_metadata(metadata: FieldMetadata, bounds: Bounds) -> dict[str, Any]:
         values["up"] = list(metadata.up)
     if metadata.sights:
         values["sights"] = [[*each.eye_m, *each.towards] for each in metadata.sights]
+    if metadata.focal_px is not None:
+        values["focal_px"] = metadata.focal_px
     return {**values, "bounds": {"low_m": list(bounds.low_m), "high_m": list(bounds.high_m)}}
 
 
@@ -244,6 +250,7 @@ def metadata_of_header(kind: str, stored: Mapping[str, Any]) -> FieldMetadata:
         sights=tuple(
             Sight(_triple(values[:3]), _triple(values[3:])) for values in stored.get("sights", ())
         ),
+        focal_px=_measured(stored, "focal_px") if "focal_px" in stored else None,
     )
 
 

@@ -1,4 +1,4 @@
-"""Check whether a field shows the place that a drive's pictures do, in the same frame."""
+"""Check that a field shows what a drive's pictures do: the place, in their frame, as finely."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rfcore.camera import Intrinsics, median_focal_px
 from rfcore.errors import InvalidInput
 from rfcore.field.interface import RadianceField
 from rfcore.field.splats import SplatField
@@ -21,6 +22,9 @@ dB in the published figures); other places and frames gave 6 to 14 dB."""
 FAR = 10.0
 """Distance of a camera from a field's middle, over that of half of the splats, from which on it is
 taken for a camera of another place: those of the sample stay below 4."""
+COARSE = 1.5
+"""Focal length of a camera over that of the training pictures from which on a field is coarse for
+it: at 2.0 half of the gain was left."""
 
 
 def check_place(
@@ -51,6 +55,19 @@ def check_place(
     return (
         f"the field's renders have {fit_db:.1f} dB against the drive's pictures, a field of the "
         f"place {FITS_DB:g} dB or more: is it of another place, frame or light? {remedy}"
+    )
+
+
+def coarseness(field: RadianceField, cameras: Sequence[Intrinsics]) -> str | None:
+    """Return a sentence if the cameras see clearly finer than the pictures that the field was
+    trained on; None if they do not, or if that is not known."""
+    trained_px, seen_px = field.metadata.focal_px, median_focal_px(cameras)
+    if trained_px is None or seen_px < COARSE * trained_px:
+        return None
+    return (
+        f"the camera sees {seen_px / trained_px:.1f} times as finely as the pictures that the "
+        f"field was trained on (focal length {seen_px:.0f} px, theirs {trained_px:.0f} px), so it "
+        "saves less here: train it on pictures of this size"
     )
 
 

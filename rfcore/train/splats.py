@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from itertools import islice
+from itertools import islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -60,9 +60,11 @@ class SplatTrainingConfig:
     density: DensityControl = field(default_factory=DensityControl)
     regularisation: Regularisation = field(default_factory=Regularisation)
     bands: Bands = field(default_factory=Bands)
-    halved_until: float = 0.0
-    """Share of the run with pictures of half the width and height, which cost less and are enough
-    to place Gaussians (DashGaussian, Chen et al. 2025, with a fixed share)."""
+    halved_until: tuple[float, ...] = ()
+    """Falling shares of the run until which pictures are halved once, twice and so on: small ones
+    cost less and are enough to place Gaussians (DashGaussian, Chen et al. 2025, with fixed
+    shares). Of ``(0.5, 0.2)``, the first fifth sees pictures of a quarter of the width and
+    height."""
     antialiased: bool = False
     """Train for the antialiased mode; the field's metadata will say so."""
     exposure: bool = False
@@ -81,8 +83,9 @@ class SplatTrainingConfig:
             raise InvalidInput("training.iterations", f"{self.iterations} is outside 1..1000000")
         if not 0.01 <= self.initial_scale <= 10:
             raise InvalidInput("training.initial_scale", f"{self.initial_scale} not in 0.01..10")
-        if not 0 <= self.halved_until < 1:
-            raise InvalidInput("training.halved_until", f"{self.halved_until} is not in 0..1")
+        shares = (1.0, *self.halved_until, 0.0)
+        if not all(first > then for first, then in pairwise(shares)):
+            raise InvalidInput("training.halved_until", f"{self.halved_until} do not fall in 0..1")
         if self.refine_poses and self.exposure:
             raise InvalidInput("training.refine_poses", "goes without exposure: learn one of them")
 
@@ -125,8 +128,9 @@ class SplatTrainer(FieldTrainer):
         digest = _training_digest(pictures_digest, initial, self.config, seed)
         cameras = [target.camera for target in self._targets]
         super().__init__(self.config.iterations, digest, cameras)
-        is_halved = self.config.halved_until > 0
-        self._halves = [halved(target) for target in self._targets] if is_halved else []
+        self._sizes = [self._targets]
+        for _ in self.config.halved_until:
+            self._sizes.append(tuple(halved(target) for target in self._sizes[-1]))
         self._exposure = ExposureModel(len(self._targets)) if self.config.exposure else None
         self._names = [picture.name for picture in pictures]
         self.depth_m = typical_depth_m(initial, cameras)
@@ -238,7 +242,7 @@ class SplatTrainer(FieldTrainer):
 
     def _target(self, view: int, progress: float) -> Target:
         """Return the target picture ``view`` in its present size."""
-        return (self._halves if progress < self.config.halved_until else self._targets)[view]
+        return self._sizes[sum(progress < share for share in self.config.halved_until)][view]
 
     def _descend_with_pose(
         self, poses: PoseModel, view: int, rates: LearningRates, progress: float

@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, TileOrigin
+from rfcore.camera import Camera, TileOrigin, median_focal_px
 from rfcore.errors import FieldFormatError, InvalidInput, TrainingDiverged
 from rfcore.field import FieldMetadata, RadianceField
 from rfcore.field.archive import Archive, decode_archive, encode_archive, read_file
@@ -135,6 +135,7 @@ class FieldTrainer(ABC):
         self._watch = DivergenceWatch()
         self._up = vertical_of(camera.world_from_cam for camera in cameras)
         self._sights = sights_of(cameras)
+        self._focal_px = median_focal_px([c.intrinsics for c in cameras]) if cameras else None
 
     @property
     def finished(self) -> bool:
@@ -218,6 +219,7 @@ class FieldTrainer(ABC):
             anchor=anchor,
             up=self._up,
             sights=self._sights,
+            focal_px=self._focal_px,
         )
 
 

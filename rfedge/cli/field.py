@@ -251,6 +251,7 @@ class FieldCheck:
         """Check; a field that does not fit is an error."""
         from rfcore.errors import InvalidData
         from rfcore.field import SplatField, save_field
+        from rfcore.field.place import coarseness
         from rfcore.field.similarity import read_field_from_world
         from rfedge.fields.check import check_field, drawn_antialiased, in_drive_world
 
@@ -268,6 +269,9 @@ class FieldCheck:
                 "--transform dataparser_transforms.json"
             )
         _print_fit(fit)
+        coarse = coarseness(field, [picture.camera.intrinsics for picture in pictures])
+        if coarse is not None:
+            print(coarse)
         if self.fix is not None:
             fixed = in_drive_world(field, fit.convention)
             print(f"{self.fix}: field {save_field(fixed, self.fix)}")

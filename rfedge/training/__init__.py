@@ -348,7 +348,7 @@ class Train:
         limit = self.limit
         if self.minutes is not None:
             limit = DEFAULT_LIMIT if limit is None else limit
-            config = replace(config, halved_until=HALVED_UNTIL)
+            config = replace(config, halved_until=(HALVED_UNTIL,))
         if limit is not None:
             config = replace(config, density=DensityControl(limit=limit))
         bands = Bands(self.sh_degree, SH_RISE if self.sh_degree else 0.0)

@@ -34,9 +34,9 @@ def test_a_field_survives_its_file(tmp_path, n, sh_degree):
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_the_vertical_and_the_sights_of_its_cameras_survive_the_file(tmp_path):
+def test_what_is_known_of_its_training_cameras_survives_the_file(tmp_path):
     sights = (Sight((1.5, -2.0, 0.25), (0.6, 0.0, 0.8)), Sight((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
-    stated = replace(METADATA, up=(0.0, -1.0, 0.0), sights=sights)
+    stated = replace(METADATA, up=(0.0, -1.0, 0.0), sights=sights, focal_px=320.25)
     save_field(SplatField(make_gaussians(), stated).compressed(), tmp_path / "a.rff")
     back = load_field(tmp_path / "a.rff")
     assert back.metadata == stated
@@ -53,9 +53,12 @@ def test_the_vertical_and_the_sights_of_its_cameras_survive_the_file(tmp_path):
         ("up", [0, 1]),
         ("sights", [[0] * 6]),
         ("sights", [[0, 0, 0, 0, 0, 1]] * 65),
+        ("focal_px", 0),
+        ("focal_px", -1),
+        ("focal_px", "320"),
     ],
 )
-def test_a_vertical_or_sight_that_is_none_is_refused(key, value):
+def test_a_training_camera_that_can_be_none_is_refused(key, value):
     archive = SplatField(make_gaussians(), METADATA).archive()
     broken = Archive(archive.kind, {**archive.metadata, key: value}, archive.arrays)
     with pytest.raises(FieldFormatError):

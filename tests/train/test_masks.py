@@ -48,7 +48,7 @@ def arrays(trainer) -> list[bytes]:
         SHORT,
         replace(SHORT, exposure=True),
         replace(SHORT, refine_poses=True),
-        replace(SHORT, halved_until=0.5),
+        replace(SHORT, halved_until=(0.5,)),
         replace(SHORT, sky=50),
     ],
 )

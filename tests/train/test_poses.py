@@ -118,7 +118,7 @@ def test_a_run_goes_on_from_its_arrays():
     assert one.camera(1) == other.camera(1)
 
 
-@pytest.mark.parametrize("halved_until", [0.0, 0.5])
+@pytest.mark.parametrize("halved_until", [(), (0.5,)])
 def test_training_with_wrong_poses_ends_nearer_to_the_right_ones(scene, halved_until):
     """Relative to each other: the mean of all corrections is held."""
     field, rng = SplatField(scene), np.random.default_rng(9)

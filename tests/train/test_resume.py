@@ -19,7 +19,7 @@ EVERYTHING = replace(
     ),
     regularisation=Regularisation(0.01, 0.01),
     bands=Bands(rise=0.1),
-    halved_until=0.7,
+    halved_until=(0.7, 0.3),
     antialiased=True,
     exposure=True,
 )

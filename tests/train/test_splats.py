@@ -97,7 +97,7 @@ def test_the_first_share_of_a_run_looks_at_halved_pictures(posed, points):
         y, x = np.mgrid[:24, :40]
         return np.repeat((255 * ((x + y) % 2))[..., None], 3, axis=2).astype(np.uint8)
 
-    config = replace(SHORT, halved_until=0.5)
+    config = replace(SHORT, halved_until=(0.5,))
     losses = [progress.loss for progress in trained_losses(posed(fine), points, config)]
     assert max(losses[25:30]) < 0.25 * min(losses[30:35])
 
@@ -163,8 +163,9 @@ def test_an_empty_field_against_grey_has_the_closed_form_quality(posed):
         ({"iterations": 0}, "training.iterations: 0"),
         ({"sky": -1}, "training.sky: -1"),
         ({"sky": 1_000_001}, "training.sky: 1000001"),
-        ({"halved_until": 1.0}, "training.halved_until: 1.0"),
-        ({"halved_until": float("nan")}, "training.halved_until: nan"),
+        ({"halved_until": (1.0,)}, r"training.halved_until: \(1.0,\)"),
+        ({"halved_until": (0.2, 0.2)}, r"training.halved_until: \(0.2, 0.2\)"),
+        ({"halved_until": (float("nan"),)}, r"training.halved_until: \(nan,\)"),
         ({"initial_scale": float("nan")}, "training.initial_scale: nan"),
     ],
 )

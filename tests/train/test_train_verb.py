@@ -214,8 +214,8 @@ def test_only_a_run_short_of_time_begins_with_halved_pictures(wall, tmp_path):
         verb(wall, tmp_path / "a.rff", minutes=minutes).training_job().config
         for minutes in (1.0, None)
     )
-    assert by_time.halved_until == 0.25
-    assert by_count.halved_until == 0
+    assert by_time.halved_until == (0.25,)
+    assert by_count.halved_until == ()
 
 
 @pytest.fixture

@@ -107,11 +107,12 @@ def test_metadata_states_the_run_and_what_was_measured():
     assert trainer.field() == FieldMetadata(training_digest=DIGEST, antialiased=True)
 
 
-def test_metadata_states_which_way_was_up_for_the_cameras_and_where_they_stood():
+def test_metadata_states_what_the_cameras_show():
     level = Camera(Intrinsics(8, 6, 8.0, 8.0, 4.0, 3.0), Pose.identity())
     metadata = Scripted([0.4], [level]).field()
     assert metadata.up == (0.0, -1.0, 0.0)
     assert metadata.sights == (Sight((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),)
+    assert metadata.focal_px == 8.0
 
 
 @pytest.mark.parametrize("config", [SplatTrainingConfig(), NgpTrainingConfig()])
