@@ -1,9 +1,5 @@
 """Train a field with progress on the console, and measure it on pictures it never saw.
 
-The estimate of memory that is printed before a run starts is the sum of all allocations for the
-largest set of primitives that the run may grow to. tests/train/test_training_memory.py compares it
-with a run: it is within 15 %.
-
 With refined poses held-out pictures have wrong poses like the others, and measured at these every
 field looks bad. Aligned with the field one by one, as a vehicle does that finds its pose in the
 field, they show how good the field is. Since that uses the pictures' own pixels, both figures are
@@ -30,8 +26,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.place import FITS_DB
 from rfcore.files import write_whole
-from rfcore.ngp.shape import FEATURES
-from rfcore.train.ngp import NgpModel, NgpTrainer, NgpTrainingConfig
+from rfcore.train.ngp import NgpTrainer, NgpTrainingConfig
 from rfcore.train.poses import PoseCorrection, align_pictures
 from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 from rfcore.train.start import random_points
@@ -48,6 +43,12 @@ from rfedge.arguments import time_text
 from rfedge.results import make_result, provenance
 from rfedge.training.finish import finishing_s
 from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing
+from rfedge.training.memory import (
+    available_bytes,
+    check_memory,
+    most_gaussians,
+    training_bytes,
+)
 
 
 @dataclass(frozen=True)
@@ -106,68 +107,6 @@ def write_refined_poses(
         numbers = " ".join(f"{value:.12g}" for value in (*pose.translation_m, x, y, z, w))
         lines += [f"# {picture.name}", f"{time_text} {numbers}"]
     write_whole(out, "\n".join(lines) + "\n")
-
-
-BASE_BYTES = 350 << 20
-"""Memory of the interpreter, numpy, PyAV, the report's libraries and the neighbour search."""
-FLOATS_OF_GEOMETRY = 11
-SETS = 3
-"""Number of copies of the parameters: themselves and two moments."""
-SLACK = 1.25
-"""Buffers that grow are allocated a quarter larger than asked for."""
-SPLAT_BYTES = 64 + 3 * 16 + 2 * 4 + 8
-"""Projected splat, its sort items, its scores, its range of entries."""
-ENTRIES_PER_GAUSSIAN = 5
-"""Overlaps with tiles of 16x16 pixels; 3 to 4 on the street at 640x360."""
-ENTRY_BYTES = 64 + 3 * 4
-NGP_CELL_BYTES = 5
-"""Bytes of a cell of the occupancy grid: a float and a bit, twice while it is rebuilt."""
-NGP_SCRATCH_BYTES = 150 << 20
-"""Samples and activations of one batch."""
-TWO_SIZES = 1.25
-"""Pixels of a picture and of its halved copy, over those of the picture."""
-PICTURE_FLOATS = 9
-"""Floats of a pixel: colour, target and gradient, three channels each."""
-
-
-def splat_training_bytes(gaussians: int, sh_degree: int, sizes_px: list[tuple[int, int]]) -> int:
-    """Return an estimate of the peak for ``gaussians`` and pictures of ``sizes_px``."""
-    parameters = 4 * (FLOATS_OF_GEOMETRY + 3 * (sh_degree + 1) ** 2)
-    # The set is copied once: when it grows, for a measurement, or for a checkpoint.
-    of_gaussians = gaussians * (parameters * (SETS * SLACK + SETS) + SPLAT_BYTES * SLACK)
-    of_entries = gaussians * ENTRIES_PER_GAUSSIAN * ENTRY_BYTES * SLACK
-    pixels = [width * height for width, height in sizes_px]
-    of_pictures = 3 * TWO_SIZES * sum(pixels) + 4 * PICTURE_FLOATS * max(pixels, default=0)
-    return BASE_BYTES + int(of_gaussians + of_entries + of_pictures)
-
-
-def ngp_training_bytes(model: NgpModel, sizes_px: list[tuple[int, int]]) -> int:
-    """Return an estimate of the peak for a hash grid and pictures of ``sizes_px``."""
-    table = 4 * FEATURES * model.L << model.log2_T
-    # Parameters, gradient, two moments, and one copy for a measurement or a checkpoint's four.
-    of_grid = 8 * table + NGP_CELL_BYTES * model.occupancy
-    pixels = sum(width * height for width, height in sizes_px)
-    return BASE_BYTES + NGP_SCRATCH_BYTES + of_grid + 3 * pixels
-
-
-def available_bytes(meminfo: Path = Path("/proc/meminfo")) -> int | None:
-    """Return the memory available without swapping, or None if the system does not say."""
-    try:
-        lines = meminfo.read_text().splitlines()
-    except OSError:
-        return None
-    kib = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    return kib[0] << 10 if kib else None
-
-
-def check_memory(needed: int, available: int | None) -> None:
-    """Raise ``InvalidInput`` when a run needs more memory than there is."""
-    if available is not None and needed > available:
-        raise InvalidInput(
-            "training",
-            f"needs about {needed / 2**30:.1f} GiB of memory and {available / 2**30:.1f} GiB are "
-            "available; take fewer Gaussians, fewer views or a smaller --size",
-        )
 
 
 JUDGED, MEANT = 8, 16
@@ -313,16 +252,12 @@ def _trainer(job: TrainingJob) -> FieldTrainer:
 
 def needed_bytes(job: TrainingJob) -> int:
     """Return an estimate of the peak memory of a job."""
-    config = job.config
+    return training_bytes(job.config, _sizes_px(job))
+
+
+def _sizes_px(job: TrainingJob) -> list[tuple[int, int]]:
     cameras = [picture.camera.intrinsics for picture in job.dataset.pictures]
-    sizes = [(k.width_px, k.height_px) for k in cameras]
-    if isinstance(config, NgpTrainingConfig):
-        return ngp_training_bytes(config.model, sizes)
-    return splat_training_bytes(_most_gaussians(config), config.bands.degree, sizes)
-
-
-def _most_gaussians(config: SplatTrainingConfig) -> int:
-    return max(config.gaussians + config.sky, config.density.limit)
+    return [(k.width_px, k.height_px) for k in cameras]
 
 
 def _announce(job: TrainingJob, console: Console) -> None:
@@ -330,7 +265,7 @@ def _announce(job: TrainingJob, console: Console) -> None:
     if isinstance(config, NgpTrainingConfig):
         what = "a hash grid"
     else:
-        what = f"{_most_gaussians(config):,} Gaussians at most"
+        what = f"{most_gaussians(config):,} Gaussians at most"
         what += "" if job.dataset.points is not None else ", from random points,"
     length = f"{config.iterations:,} iterations"
     if job.limits.minutes is not None:
@@ -347,7 +282,7 @@ def _announce(job: TrainingJob, console: Console) -> None:
             console.print("  the cameras do not agree which way is up: z is taken")
         elif up != Z_UP:
             console.print(f"  up is {direction(up)}, as the cameras show")
-    check_memory(needed, available_bytes())
+    check_memory(config, _sizes_px(job), available_bytes())
     console.print("  reading the pictures")
 
 

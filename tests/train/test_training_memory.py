@@ -2,21 +2,68 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.training.run import BASE_BYTES, available_bytes, check_memory, splat_training_bytes
+from rfcore.train.ngp import NgpTrainingConfig
+from rfcore.train.schedule import DensityControl
+from rfcore.train.splats import SplatTrainingConfig
+from rfedge.arguments import parse_size
+from rfedge.training.memory import (
+    BASE_BYTES,
+    available_bytes,
+    check_memory,
+    splat_training_bytes,
+    training_bytes,
+)
 
 SIZE_PX = (320, 184)
 GAUSSIANS = 60_000
 
 
-def test_a_run_that_does_not_fit_is_refused_with_both_figures():
-    with pytest.raises(InvalidInput, match=r"3\.0 GiB of memory and 2\.0 GiB are available"):
-        check_memory(3 << 30, 2 << 30)
-    check_memory(2 << 30, 2 << 30)
-    check_memory(2 << 30, None)
+STREET = SplatTrainingConfig(density=DensityControl(limit=1_500_000), halved_until=(0.5, 0.2))
+LARGE_PX = [(1920, 1080)] * 120
+
+
+@pytest.mark.parametrize(
+    ("config", "available", "options"),
+    [
+        (STREET, 4 << 30, ["--limit", "--size"]),
+        (STREET, 2 << 30, ["--limit"]),
+        (replace(STREET, sky=60_000), 1 << 30, ["--size --limit --gaussians"]),
+        (replace(STREET, gaussians=1_000_000, density=DensityControl()), 2 << 30, ["--gaussians"]),
+        (NgpTrainingConfig(), 1200 << 20, ["--size"]),
+    ],
+)
+def test_a_run_that_does_not_fit_says_what_does(config, available, options):
+    """Each remedy, taken alone, fits, and much more would not."""
+    with pytest.raises(InvalidInput, match=r"GiB are available; what fits: ") as refused:
+        check_memory(config, LARGE_PX, available)
+    remedies = str(refused.value).split("what fits: ")[1].split(" or ")
+    assert [" ".join(remedy.split()[::2]) for remedy in remedies] == options
+    for remedy in remedies:
+        words = remedy.split()
+        asked = dict(zip(words[::2], words[1::2], strict=True))
+        sizes_px = [parse_size(asked["--size"])] * 120 if "--size" in asked else LARGE_PX
+        tried = config
+        if "--limit" in asked:
+            tried = replace(tried, density=DensityControl(limit=int(asked["--limit"])))
+        if "--gaussians" in asked:
+            tried = replace(tried, gaussians=int(asked["--gaussians"]))
+        check_memory(tried, sizes_px, available)
+        assert training_bytes(tried, sizes_px) > 0.7 * available
+
+
+def test_a_run_that_no_option_brings_down_is_refused():
+    with pytest.raises(InvalidInput, match="fewer pictures"):
+        check_memory(STREET, LARGE_PX, 100 << 20)
+
+
+def test_a_run_that_fits_or_whose_limit_is_unknown_goes_on():
+    check_memory(STREET, LARGE_PX, training_bytes(STREET, LARGE_PX))
+    check_memory(STREET, LARGE_PX, None)
 
 
 def test_available_memory_is_what_the_system_says(tmp_path):
@@ -32,7 +79,8 @@ def test_more_of_anything_takes_more():
     one = splat_training_bytes(1000, 2, [SIZE_PX])
     assert splat_training_bytes(2000, 2, [SIZE_PX]) > one
     assert splat_training_bytes(1000, 3, [SIZE_PX]) > one
-    assert splat_training_bytes(1000, 2, [SIZE_PX] * 2) - one == 3 * 1.25 * 320 * 184
+    assert splat_training_bytes(1000, 2, [SIZE_PX] * 2) - one == 3 * 320 * 184
+    assert splat_training_bytes(1000, 2, [SIZE_PX], 1) - one == 0.75 * 320 * 184
 
 
 RUN = f"""
