@@ -18,7 +18,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse lossy-link robust ladder latency head compare compare-small)
 	cp $^ lab/results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark $(if $(DATA),detect) rig live cold-start world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder compare-size robust-long localise benchmark $(if $(DATA),detect) rig live cold-start world paper)
 	cp $(filter %.json,$^) lab/results/
 	$(MAKE) -f lab/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -113,7 +113,7 @@ UNDISTORTED := $(SCENES)/undistorted/transforms.json
 $(UNDISTORTED): $(call drive,lens)
 	$(RFEDGE) dataset convert $< --out $(@D)
 
-HARDER := lane-0.6 lane-1.5 dusk rain rolling-shutter exposure people vehicles-720p
+HARDER := lane-0.6 lane-1.5 dusk rain rolling-shutter exposure people
 HARDER_DRIVES := $(foreach name,$(HARDER) 20hz,$(call drive,$(name))) $(UNDISTORTED)
 
 NOON := sample-empty@10=$(EMPTY) sample-vehicles@10=$(VEHICLES)
@@ -125,6 +125,33 @@ YARDSTICK_30 := $(if $(DATA),yardstick-empty@30=$(YARD)/transforms_drive30_empty
 	yardstick-vehicles@30=$(YARD)/transforms_drive30_vehicles.json$(COMMA)$(OUT)/yardstick.rff)
 NOISY := sample-vehicles@10=$(VEHICLES)$(COMMA)noise=1.5 sample-vehicles@10=$(VEHICLES)$(COMMA)noise=3 \
 	$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_vehicles.json$(COMMA)$(OUT)/yardstick.rff$(COMMA)noise=3)
+
+# --- the sample's street at sizes that cameras have: views to train on, the two drives, and a field of each size
+# `make -f lab/record.mk sizes` renders them, 1280x720 in 35 minutes of two cores and 1920x1080 in 80; streetgen says how
+# long before it starts, and goes on where it was stopped.
+
+SIZE := $(OUT)/size
+SIZES := 1280x720 1920x1080
+.PHONY: sizes
+sizes: $(foreach size,$(SIZES),$(SIZE)/$(size)/train/transforms_train.json \
+	$(foreach of,empty vehicles,$(SIZE)/$(size)/$(of)/transforms_drive.json))
+$(SIZE)/%/train/transforms_train.json:
+	$(STREETGEN) build samples/street/empty.toml --split train --size $* --spp 4 --out $(@D)
+$(SIZE)/%/empty/transforms_drive.json:
+	$(STREETGEN) build samples/street/empty.toml --split drive --size $* --spp 9 --out $(@D)
+$(SIZE)/%/vehicles/transforms_drive.json:
+	$(STREETGEN) build samples/street/vehicles.toml --split drive --size $* --spp 9 --out $(@D)
+$(SIZE)/1280x720.rff: LIMITS = --limit 600000 --iterations 12000 --max-mb 8
+$(SIZE)/1920x1080.rff: LIMITS = --limit 1200000 --iterations 14000 --max-mb 12
+$(SIZE)/%.rff: $(SIZE)/%/train/transforms_train.json $(SIZE)/%/empty/transforms_drive.json
+	$(RFEDGE) train $< --points samples/street/points.ply --held-out $(word 2,$^) --antialiased --sh-degree 1 --sky 60000 \
+		$(LIMITS) --json $(@:.rff=.json) --out $@
+sized = sample-$1-$2@10=$(SIZE)/$2/$1/transforms_drive.json$(COMMA)$(SIZE)/$3.rff
+OF_SIZES := $(foreach size,$(SIZES),$(foreach of,empty vehicles,$(call sized,$(of),$(size),$(size))))
+# The largest one's field at smaller sizes, too.
+LARGEST := $(lastword $(SIZES))
+OF_ONE := $(foreach of,empty vehicles,sample-$(of)@10=samples/street/transforms_drive_$(of).json$(COMMA)$(SIZE)/$(LARGEST).rff \
+	$(foreach size,$(filter-out $(LARGEST),$(SIZES)),$(call sized,$(of),$(size),$(LARGEST))))
 
 # --- records
 
@@ -152,6 +179,9 @@ $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) $(if $(DATA),$(RESIDENTIA
 		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) \
 		--background sample-people@10=$(EMPTY) \
 		--processes $(shell nproc) --cells $(OUT)/compare --out $@
+$(OUT)/compare-size.json: $(foreach size,$(SIZES),$(SIZE)/$(size).rff $(SIZE)/$(size)/vehicles/transforms_drive.json) | $(OUT)
+	$(RFEDGE) eval compare $(SAMPLE) $(OF_SIZES) $(OF_ONE) --rivals x264-our-tools-medium svtav1-lowdelay-p4 \
+		--method lab.libaom:Good3 lab.libaom:Good6 --processes $(shell nproc) --cells $(OUT)/compare --out $@
 $(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --processes $(shell nproc) --cells $(OUT)/compare --out $@ \
 		$(foreach k,30 60,$(foreach drive,$(NOON),$(drive)$(COMMA)$(OUT)/sample-$(k)k.rff) \
