@@ -141,8 +141,8 @@ $(SIZE)/%/empty/transforms_drive.json:
 	$(STREETGEN) build samples/street/empty.toml --split drive --size $* --spp 9 --out $(@D)
 $(SIZE)/%/vehicles/transforms_drive.json:
 	$(STREETGEN) build samples/street/vehicles.toml --split drive --size $* --spp 9 --out $(@D)
-$(SIZE)/1280x720.rff: LIMITS = --limit 600000 --iterations 12000 --max-mb 8
-$(SIZE)/1920x1080.rff: LIMITS = --limit 1200000 --iterations 14000 --max-mb 12
+$(SIZE)/1280x720.rff: LIMITS = --limit 600000 --iterations 10000 --max-mb 8
+$(SIZE)/1920x1080.rff: LIMITS = --limit 1200000 --iterations 12000 --max-mb 12
 $(SIZE)/%.rff: $(SIZE)/%/train/transforms_train.json $(SIZE)/%/empty/transforms_drive.json
 	$(RFEDGE) train $< --points samples/street/points.ply --held-out $(word 2,$^) --antialiased --sh-degree 1 --sky 60000 \
 		$(LIMITS) --json $(@:.rff=.json) --out $@

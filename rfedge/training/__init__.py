@@ -19,6 +19,7 @@ from rfedge.arguments import DATASET, FOLDER, PLY, SIZE, parse_size
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from rfcore.dataset import Dataset
     from rfcore.field import RadianceField
     from rfcore.train.ngp import NgpTrainingConfig
     from rfcore.train.splats import SplatTrainingConfig
@@ -36,8 +37,10 @@ DEFAULT_LIMIT = 250_000
 KEPT_SHARE, MOST_KEPT_S = 0.25, 120.0
 """Share of --minutes that is kept for levels of detail, and the most: all their iterations take
 about 90 s on two cores."""
-HALVED_UNTIL = 0.25
-"""Share of a run limited by time that trains on halved pictures (docs/how-to/training.md)."""
+HALVED_UNTIL, LARGE_HALVED_UNTIL = (0.25,), (0.6, 0.25)
+"""Shares of a run with smaller pictures (docs/how-to/training.md): of one limited by time, and of
+every one with pictures larger than ``LARGE_PX`` pixels."""
+LARGE_PX = 500_000
 
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
@@ -313,7 +316,7 @@ class Train:
             checkpoint_every=self.checkpoint_every or 1000,
             measurements=12 if self.kind == "splats" else 4,  # rendering a hash grid takes seconds
         )
-        config = self._config(dataset.exposure_varies)
+        config = self._config(dataset)
         return TrainingJob(
             name=self.name,
             dataset=dataset,
@@ -333,7 +336,7 @@ class Train:
             return 0.0
         return min(KEPT_SHARE * 60 * self.minutes, MOST_KEPT_S)
 
-    def _config(self, exposure_varies: bool) -> SplatTrainingConfig | NgpTrainingConfig:
+    def _config(self, dataset: Dataset) -> SplatTrainingConfig | NgpTrainingConfig:
         from rfcore.train.ngp import NgpTrainingConfig
         from rfcore.train.schedule import Bands, DensityControl
         from rfedge.training.run import UNLIMITED_ITERATIONS, training_config
@@ -348,12 +351,15 @@ class Train:
         limit = self.limit
         if self.minutes is not None:
             limit = DEFAULT_LIMIT if limit is None else limit
-            config = replace(config, halved_until=(HALVED_UNTIL,))
+            config = replace(config, halved_until=HALVED_UNTIL)
+        sizes_px = [picture.camera.intrinsics for picture in dataset.pictures]
+        if min(k.width_px * k.height_px for k in sizes_px) > LARGE_PX:
+            config = replace(config, halved_until=LARGE_HALVED_UNTIL)
         if limit is not None:
             config = replace(config, density=DensityControl(limit=limit))
         bands = Bands(self.sh_degree, SH_RISE if self.sh_degree else 0.0)
         config = replace(config, bands=bands, antialiased=self.antialiased)
-        return replace(config, exposure=exposure_varies, refine_poses=self.refine_poses)
+        return replace(config, exposure=dataset.exposure_varies, refine_poses=self.refine_poses)
 
     def _finished(self, job: TrainingJob, trained: Trained, console: Console) -> RadianceField:
         from rfcore.field import SplatField

@@ -209,13 +209,25 @@ def test_a_part_of_the_minutes_is_kept_for_levels_of_detail(
     assert verb(wall, tmp_path / "a.rff", **settings).training_job().limits.kept_s == kept_s
 
 
-def test_only_a_run_short_of_time_begins_with_halved_pictures(wall, tmp_path):
-    by_time, by_count = (
-        verb(wall, tmp_path / "a.rff", minutes=minutes).training_job().config
-        for minutes in (1.0, None)
-    )
-    assert by_time.halved_until == (0.25,)
-    assert by_count.halved_until == ()
+@pytest.mark.parametrize(
+    ("minutes", "size_px", "halved_until"),
+    [
+        (1.0, (640, 360), (0.25,)),
+        (None, (640, 360), ()),
+        (1.0, (1280, 720), (0.6, 0.25)),
+        (None, (1280, 720), (0.6, 0.25)),
+    ],
+)
+def test_a_run_short_of_time_or_with_large_pictures_begins_with_smaller_ones(
+    tmp_path, minutes, size_px, halved_until
+):
+    width, height = size_px
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((height, width, 3), np.uint8))
+    k = {"fl_x": width, "fl_y": width, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
+    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({**k, "frames": frames}))
+    job = verb(tmp_path, tmp_path / "a.rff", minutes=minutes, holdout=None).training_job()
+    assert job.config.halved_until == halved_until
 
 
 @pytest.fixture
