@@ -42,6 +42,7 @@ from rfedge.video import bt709_stream, even_frame
 
 if TYPE_CHECKING:
     from rfcore.field import RadianceField
+    from rfedge.cpm import CpmFile
     from rfedge.mcap_file import McapFile
 
 TICKS_PER_S = 90_000
@@ -176,6 +177,8 @@ class WatchSettings:
     folder: Path | None = None
     video: Path | None = None
     mcap: Path | None = None
+    cpm: Path | None = None
+    station: int = 0
     encoding: str | None = None
     pictures: int | None = None
 
@@ -232,16 +235,45 @@ class TwinMcap:
         self._file.show(shown, time.time_ns())
         if self._objects is not None and picture.field_id not in self._fields:
             self._fields.add(picture.field_id)
-            threading.Thread(
-                target=self._follow, args=(self._objects, picture.field_id), daemon=True
-            ).start()
+            _follow(self._objects, picture.field_id, self._show)
 
-    def _follow(self, objects: ObjectsOf, field_id: str) -> None:
+    def _show(self, seen: ObjectsSeen) -> None:
+        self._file.show_objects(seen.field_id, seen.objects, seen.time_ns, time.time_ns())
+
+
+class TwinCpm:
+    """Keeps the objects on one field as Collective Perception Messages (``rfedge.cpm``)."""
+
+    def __init__(self, file: CpmFile, objects: ObjectsOf, field_id: str) -> None:
+        self._file, self._objects, self._field_id = file, objects, field_id
+        self._fields: set[str] = set()
+
+    def keep(self, picture: TwinPicture) -> None:
+        """Follow the objects from the first picture on; say which fields are other ones."""
+        if not self._fields:
+            _follow(self._objects, self._field_id, self._show)
+        if picture.field_id not in self._fields and picture.field_id != self._field_id:
+            _say(
+                f"a picture is of field {picture.field_id[:12]}, --field is {self._field_id[:12]}: "
+                "objects are told of if both are versions of one tile"
+            )
+        self._fields.add(picture.field_id)
+
+    def _show(self, seen: ObjectsSeen) -> None:
+        self._file.show_objects(seen.objects, seen.time_ns)
+
+
+def _follow(objects: ObjectsOf, field_id: str, show: Callable[[ObjectsSeen], None]) -> None:
+    """Show a field's objects from a thread of their own, until the source ends."""
+
+    def run() -> None:
         try:
             for seen in objects(ObjectsRequest(field_id=field_id)):
-                self._file.show_objects(field_id, seen.objects, seen.time_ns, time.time_ns())
+                show(seen)
         except RfedgeError as error:
             _say(f"no objects: {error}")
+
+    threading.Thread(target=run, daemon=True).start()
 
 
 @contextmanager
@@ -256,6 +288,20 @@ def _opened_mcap(
         _say(f"{path}: {file.late} pictures left out, not taken later than the ones before them")
 
 
+@contextmanager
+def _opened_cpm(
+    settings: WatchSettings, path: Path, objects: ObjectsOf | None, field: RadianceField | None
+) -> Iterator[TwinCpm]:
+    from rfedge.cpm import CpmFile
+
+    if objects is None:
+        raise InvalidInput("cpm", "servers' objects do not come by NATS: name one, HOST:PORT")
+    if field is None:
+        raise InvalidInput("cpm", "needs --field, which says where on the Earth the objects are")
+    with CpmFile(path, field.metadata, settings.station) as file:
+        yield TwinCpm(file, objects, field.field_id)
+
+
 def watch(
     settings: WatchSettings,
     source: PictureSource,
@@ -264,7 +310,8 @@ def watch(
 ) -> None:
     """Print and keep what ``source`` shows, until it ends, is stopped, or enough was seen.
 
-    An MCAP file has ``objects``, too, and shows ``field`` as points.
+    An MCAP file has ``objects``, too, and shows ``field`` as points. Collective Perception Messages
+    tell of the ``objects`` on ``field``, where its anchor says.
     Files are whole when it returns or raises. Raises ``RfedgeError`` if the source is not there or
     refuses.
     """
@@ -275,6 +322,9 @@ def watch(
         mcap = None
         if settings.mcap is not None:
             mcap = stack.enter_context(_opened_mcap(settings.mcap, objects, field))
+        cpm = None
+        if settings.cpm is not None:
+            cpm = stack.enter_context(_opened_cpm(settings, settings.cpm, objects, field))
         wait_for = stack.enter_context(waiting("a connection", _say_wait))
 
         def connected(may_see: str) -> None:
@@ -295,6 +345,8 @@ def watch(
                 video.keep(message)
             if mcap is not None:
                 mcap.keep(message)
+            if cpm is not None:
+                cpm.keep(message)
             pictures += 1
             if pictures == settings.pictures:
                 return

@@ -26,8 +26,14 @@ class Watch:
     mcap: Annotated[Path | None, arg(metavar="FILE.mcap")] = None
     """Keep all cameras as MCAP for Foxglove and the like: video, calibration, poses, metrics, and
     the objects of a server, which cost it time (docs/how-to/bags.md)."""
+    cpm: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None
+    """Keep the objects of a server on --field, which needs an anchor, as Collective Perception
+    Messages of ETSI, a line of JSON each with the UPER as hexadecimal digits."""
+    station: int = 0
+    """With --cpm: the stationId of the messages."""
     field: Annotated[Path | None, FIELD] = None
-    """With --mcap: show this field's splats as points; its world is that of the poses."""
+    """With --mcap: show this field's splats as points; its world is that of the poses. With --cpm:
+    the field of the objects."""
     encoding: Literal["none", "i420", "jpeg", "png"] | None = None
     """Form in which pictures are sent; default: i420 (exact) for a video or an MCAP, jpeg for a
     folder, else none."""
@@ -41,16 +47,20 @@ class Watch:
         from rfcore.extras import require
         from rfedge.watch import WatchSettings, watch_until_stopped
 
-        if self.field is not None and self.mcap is None:
-            raise InvalidInput("field", "belongs to --mcap, whose points it becomes")
+        if self.field is not None and self.mcap is None and self.cpm is None:
+            raise InvalidInput("field", "belongs to --mcap or --cpm")
         if self.mcap is not None:
             require("bags", "mcap", "foxglove_schemas_protobuf")
+        if self.cpm is not None:
+            require("v2x", "asn1tools", "pymap3d")
         field = open_field(self.field) if self.field is not None else None
         settings = WatchSettings(
             vehicle_ids=frozenset(self.vehicle),
             folder=self.dir,
             video=self.mp4,
             mcap=self.mcap,
+            cpm=self.cpm,
+            station=self.station,
             encoding=self.encoding,
             pictures=self.pictures,
         )
