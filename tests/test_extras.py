@@ -223,6 +223,7 @@ DRIVE = f"empty@10={ROOT / 'samples/street/transforms_drive_empty.json'}"
         ("scipy", "eval", f"eval compare {FIELD} {DRIVE}"),
         ("scipy", "eval", f"eval never-worse {FIELD} {DRIVE}"),
         ("cv2", "localise", f"localise {DRIVE.partition('=')[2]} --field {FIELD}"),
+        ("asn1tools", "v2x", f"watch 127.0.0.1:1 --cpm made.jsonl --field {FIELD}"),
         ("nats", "nats", "watch --nats nats://127.0.0.1:4222"),
         ("psutil", "loadtest", "loadtest"),
         ("h2", "loadtest", "loadtest"),

@@ -4,8 +4,10 @@ import asyncio
 import doctest
 import gc
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,9 @@ from mec_server.config import ServerBudget, SessionLimits
 from mec_server.twin import rendering
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
+from rfcore.field import load_field
+from rfcore.field.store import anchored_file
+from rfcore.geodesy import Anchor
 from rfcore.image import read_rgb
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.twin import (
@@ -33,6 +38,7 @@ from rfcore.wire.twin import (
 from rfcore.wire.twin_client import TwinClient
 from rfcore.wire.twin_render import (
     ObjectsRequest,
+    ObjectsSeen,
     ViewRequest,
     objects_request_to_wire,
     view_request_to_wire,
@@ -258,6 +264,48 @@ async def test_the_watch_command_keeps_an_mcap_of_what_the_server_shows(
     assert kept["/cav-1/front/video"] == "foxglove.CompressedVideo"
     assert kept["/tf"] == "foxglove.FrameTransform"
     assert 1 <= [topic for _, topic in found].count("/cav-1/front/video") <= 4
+
+
+@pytest.mark.usefixtures("small_things")
+async def test_the_watch_command_keeps_what_the_server_sees_as_collective_perception_messages(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path
+) -> None:
+    """The red box of the drive, on the same field with an anchor."""
+    field_id = anchored_file(street.store / "street.rff", Anchor(48, 11), tmp_path / "street.rff")
+    kept = tmp_path / "kept" / "seen.jsonl"
+    settings, field = WatchSettings(cpm=kept, station=42), load_field(tmp_path / "street.rff")
+    async with serve(fields=tmp_path) as server, raw_vehicle(server.address) as vehicle:
+        with TwinClient(str(server.address)) as client:
+            reports = []
+
+            def objects(request: ObjectsRequest) -> Iterator[ObjectsSeen]:
+                for seen in client.objects(request):
+                    reports.append(seen)
+                    yield seen
+
+            watching = asyncio.create_task(
+                asyncio.to_thread(watch, settings, client, objects, field)
+            )
+            await vehicle.greet(replace(coded.hello, field_ids=(field_id,)))
+            for number, frame in enumerate(coded.frames):
+                captured_ns = time.time_ns() - 15_000_000 * (5 - number)  # of different instants
+                captured = replace(frame, capture_time_ns=captured_ns)
+                assert await vehicle.told(captured) == ("ack", number)
+                while len(reports) <= number:
+                    await asyncio.sleep(0.001)
+            async with asyncio.timeout(15):
+                while '"objectId"' not in kept.read_text():
+                    await asyncio.sleep(0.01)
+            client.stop()
+            await watching
+    lines = [json.loads(line)["cpm"] for line in kept.read_text().splitlines()]
+    assert {line["header"]["stationId"] for line in lines} == {42}
+    position = lines[-1]["payload"]["managementContainer"]["referencePosition"]
+    assert (position["latitude"], position["longitude"]) == (480000000, 110000000)
+    told = [line["payload"]["cpmContainers"][1]["containerData"] for line in lines]
+    one = next(each["perceivedObjects"][0] for each in told if each["perceivedObjects"])
+    assert 200 < one["position"]["zCoordinate"]["value"] < 1200, "the cloud is at 2 to 8 m"
+    assert -2048 < one["measurementDeltaTime"] < 0
 
 
 @pytest.mark.parametrize(
