@@ -109,7 +109,7 @@ GOLDEN = (
     "bfffa095fe7cdff83be23f11fddc90406400"
 )
 """Decoded to the same values by pycrate 0.8.1 from the published ASN.1 of TS 103 324 V2.1.1 and
-TS 102 894-2 V2.4.1."""
+TS 102 894-2 V2.4.1, without inner subtype constraints and with 0..14 for the vehicle classes."""
 
 
 def test_the_bits_are_those_of_the_published_definitions():
