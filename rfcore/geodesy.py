@@ -41,6 +41,20 @@ class Anchor:
         check_geodetic("anchor", self.latitude_deg, self.longitude_deg, self.height_m)
         Pose(self.point_m, self.enu_from_world)
 
+    @staticmethod
+    def of_ecef(point_m: Vec3) -> Anchor:
+        """Return the anchor of a world that is ECEF of WGS 84, at one of its points."""
+        with needs("localise"):
+            from pymap3d import ecef2geodetic
+        lat, lon, height_m = map(float, ecef2geodetic(*point_m))
+        (sin_p, cos_p), (sin_l, cos_l) = (
+            (math.sin(angle), math.cos(angle)) for angle in map(math.radians, (lat, lon))
+        )
+        east, north = (-sin_l, cos_l, 0.0), (-sin_p * cos_l, -sin_p * sin_l, cos_p)
+        up = (cos_p * cos_l, cos_p * sin_l, sin_p)
+        turn = Pose.from_matrix([[*axis, 0.0] for axis in (east, north, up)])
+        return Anchor(lat, lon, height_m, turn.rotation, point_m)
+
     def relative_to(self, origin: TileOrigin) -> Anchor:
         """Return the anchor of the world whose origin is at ``origin`` of this one."""
         moved = origin.localise(Pose(self.point_m, UPRIGHT))

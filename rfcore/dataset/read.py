@@ -2,9 +2,10 @@
 
 ``transforms.json`` (nerfstudio, instant-ngp), a COLMAP model, a KITTI odometry sequence or raw
 drive, INRIA's ``cameras.json``, ``camera.toml`` for a recording of one's own, or what servers
-recorded: one ``recording.jsonl``, or a folder that they lie below, together in order of time; or an
-MCAP file or ROS 2 bag. A folder with more than one of the others is ambiguous: the file itself is
-to be named.
+recorded: one ``recording.jsonl``, or a folder that they lie below, together in order of time; an
+MCAP file or ROS 2 bag; or a drive of a public set (``rfcore.dataset.drive_sets``). A folder with
+more than one of the others is ambiguous: the file itself is to be named. ``PATH#NAME`` chooses a
+camera of a set, or a topic of a bag.
 
 ``read_inria_source`` reads the ``cameras.json`` of the INRIA 3D Gaussian Splatting code: each entry
 has ``img_name``, ``width``, ``height``, ``fx``, ``fy`` in pixels, ``position`` in the
@@ -43,6 +44,8 @@ from rfcore.camera import Intrinsics, Pose, TileOrigin
 from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions, assemble
 from rfcore.dataset.bag_file import is_bag
 from rfcore.dataset.colmap import colmap_models, images_file, read_colmap_source
+from rfcore.dataset.drive_set import DriveSet, read_chosen
+from rfcore.dataset.drive_sets import drive_set_files, open_drive_set, without_choice
 from rfcore.dataset.keys import (
     POSE_SHAPES,
     anchor_at,
@@ -269,7 +272,8 @@ def _inria_camera(where: str, keys: Table) -> SourceCamera:
 
 EXPECTED = (
     "transforms.json, sparse/0 of COLMAP, calib.txt or oxts of KITTI, cameras.json of INRIA, "
-    "camera.toml, recording.jsonl of a server, an MCAP file or ROS 2 bag"
+    "camera.toml, recording.jsonl of a server, an MCAP file or ROS 2 bag, a log or scenes of "
+    "Argoverse 2, nuScenes, 123D, comma2k19 or Boreas"
 )
 
 
@@ -299,9 +303,17 @@ def read_dataset(
 
 
 def read_source(path: Path, topics: tuple[str, ...] = ()) -> Source:
-    """Read what is there, with its lenses and its own world; of a bag, what ``topics`` name."""
-    if topics:
-        return _read_bag(path, topics)
+    """Read what is there, with its lenses and its own world; of a bag, what ``topics`` name.
+
+    ``path`` may end in ``#NAME``: a camera of a set of drives, or a topic of a bag.
+    """
+    path, choice = without_choice(path)
+    if topics or (choice and is_bag(path)):
+        return _read_bag(path, (*topics, *([choice] if choice else [])))
+    if (drives := drive_set_of(path)) is not None:
+        return read_chosen(drives, path, choice)
+    if choice:
+        raise DatasetError(f"{path}: is read as a whole; leave out #{choice}")
     if path.is_dir():
         return read_kitti_raw_source(path.parent) if path.name == OXTS else _read_folder(path)
     if not path.exists():
@@ -320,6 +332,12 @@ def read_source(path: Path, topics: tuple[str, ...] = ()) -> Source:
         refuse_video(path)
         raise DatasetError(f"{path}: is no file that describes a dataset ({EXPECTED})")
     return read_inria_source(path) if path.name == "cameras.json" else read_transforms_source(path)
+
+
+def drive_set_of(path: Path) -> DriveSet | None:
+    """Return the set of drives at a folder or its file, None where there is another dataset."""
+    found = _candidates(path) if path.is_dir() else [path]
+    return open_drive_set(found[0]) if len(found) == 1 else None
 
 
 def _read_bag(path: Path, topics: tuple[str, ...] = ()) -> Source:
@@ -372,7 +390,7 @@ def _refuse_pictures_alone(folder: Path) -> None:
 
 def _candidates(folder: Path) -> list[Path]:
     named = [folder / name for name in ("camera.toml", "cameras.json", "calib.txt")]
-    found = [file for file in named if file.is_file()]
+    found = [file for file in named if file.is_file()] + drive_set_files(folder)
     transforms = transforms_file(folder)
     models = colmap_models(folder)
     if (folder / OXTS / "data").is_dir():

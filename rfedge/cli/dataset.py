@@ -32,7 +32,8 @@ class DatasetConvert:
 
     dataset: Annotated[Path, Positional, DATASET]
     """A folder with transforms.json, a COLMAP model, a KITTI sequence, INRIA's cameras.json or a
-    recording's camera.toml; or that file itself; or an MCAP file or ROS 2 bag."""
+    recording's camera.toml; or that file itself; or an MCAP file or ROS 2 bag; or PATH#CAMERA of
+    Argoverse 2, nuScenes (PATH#SCENE/CAMERA), 123D, comma2k19 or Boreas."""
     out: Annotated[Path, FOLDER]
     """The folder to make."""
     size: Annotated[str | None, SIZE] = None

@@ -6,6 +6,7 @@ import shlex
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,19 +27,23 @@ class Doctor:
 
     path: Annotated[Path, Positional, arg(metavar="FILE|FOLDER")]
     """Splats of any program, a field, a coded drive (.rfv), a dataset, an MCAP file or ROS 2 bag,
-    pictures, a video."""
+    pictures, a video. PATH#NAME is one camera of a set of drives."""
 
     def run(self) -> None:
         """Print a line for each thing."""
         from rfcore.dataset.bag_file import is_bag
+        from rfcore.dataset.drive_sets import without_choice
         from rfcore.errors import DatasetError, InvalidData
         from rfcore.field.splat_file import looks_like_splats
         from rfcore.wire.drive_file import is_coded_drive
 
-        if not self.path.exists():
+        path, choice = without_choice(self.path)
+        if not path.exists():
             raise InvalidData(f"there is no {self.path}")
         try:
-            if is_field_file(self.path):
+            if choice:
+                lines = _of_dataset(self.path)
+            elif is_field_file(self.path):
                 lines = _of_field(self.path)
             elif is_coded_drive(self.path):
                 lines = _of_coded_drive(self.path)
@@ -134,8 +139,19 @@ def _of_bag(path: Path) -> Iterator[str]:
 
 def _of_dataset(path: Path) -> Iterator[str]:
     from rfcore.dataset.assemble import Distortion, ReadOptions, assemble
-    from rfcore.dataset.read import read_source
+    from rfcore.dataset.drive_set import names_below
+    from rfcore.dataset.drive_sets import without_choice
+    from rfcore.dataset.read import drive_set_of, read_source
 
+    place, choice = without_choice(path)
+    drives = drive_set_of(place)
+    if drives is not None and len(names := names_below(drives, choice)) > 1:
+        yield f"{path}: {len(names)} cameras, one of which is named"
+        for scene, cameras in groupby(names, lambda name: name.rpartition("/")[0]):
+            shown = " ".join(name.rpartition("/")[2] for name in cameras)
+            yield f"  {scene}: {shown}" if scene else f"  {shown}"
+        yield f"next: rfedge doctor {shlex.quote(f'{place}#{names[0]}')}"
+        return
     source = read_source(path)
     dataset = assemble(source, ReadOptions(distortion=Distortion.UNDISTORT))
     yield f"{path}: a dataset of {len(source.pictures)} pictures, described by {source.file}"
@@ -148,6 +164,8 @@ def _of_dataset(path: Path) -> Iterator[str]:
     yield from dataset.changes
     source.pictures[0].read()
     quoted = shlex.quote(str(path))
+    for feed in source.feeds:
+        yield f"{feed}: a pose feed, which `rfedge dataset convert` writes beside the pictures"
     if any(picture.camera.lens is not None for picture in source.pictures):
         yield f"next: rfedge dataset convert {quoted} --out DATASET (without the lens)"
     else:

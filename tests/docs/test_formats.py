@@ -27,6 +27,13 @@ from rfcore.field.spz import COORDINATE_SYSTEM, encode_spz
 from rfcore.raster.gaussians import Gaussians
 from rfedge.fields.confined_reader import read_confined
 from tests.dataset.conftest import GoldenScene
+from tests.dataset.public_sets import (
+    write_argoverse,
+    write_boreas,
+    write_comma,
+    write_nuscenes,
+)
+from tests.dataset.test_public_sets import LOG_123D
 from tests.field.exports.make_exports import source_splats
 from tests.field.some import as_text, compressed_ply
 
@@ -60,6 +67,8 @@ class Row:
     """Whether the file holds the splats half round x."""
     palette: bool = False
     """Whether higher bands of the colours come from a palette, as in .sog."""
+    shape: tuple[int, ...] = (48, 64, 3)
+    """Shape of a dataset's pictures."""
 
     @property
     def is_refused(self) -> bool:
@@ -401,6 +410,42 @@ DATASETS = [
     Row("KITTI odometry", "KITTI", "read", scene("kitti")),
     Row("cameras.json", "INRIA 3DGS", "read", scene("inria")),
     Row("camera.toml", "your own", "read", scene("folder")),
+    Row(
+        "Argoverse 2, a log",
+        "its layout; av2 0.3.6 projects the same",
+        "read, a camera by `LOG#CAMERA`",
+        lambda folder: Path(f"{write_argoverse(GoldenScene(), folder)}#ring_front_center"),
+        "k1 to k3 are left out",
+    ),
+    Row(
+        "nuScenes",
+        "its layout; nuscenes-devkit 1.2.0 projects the same",
+        "read, a camera by `FOLDER#SCENE/CAMERA`",
+        lambda folder: Path(f"{write_nuscenes(GoldenScene(), folder)}#scene-0061/CAM_FRONT"),
+        "world: nuScenes' global map",
+    ),
+    Row(
+        "123D, a log",
+        "py123d 0.7.0 (its file)",
+        "read, pinholes, a camera by `LOG#CAMERA`",
+        lambda _: Path(f"{LOG_123D}#pcam_b0"),
+        "3 of 3 pictures are undistorted",
+    ),
+    Row(
+        "comma2k19, a segment",
+        "its layout; its own code projects the same",
+        "read, with the fixes of its GNSS",
+        lambda folder: write_comma(GoldenScene(), folder),
+        "world: ECEF",
+        shape=(874, 1164, 3),
+    ),
+    Row(
+        "Boreas, Boreas-RT, a drive",
+        "its layout; pyboreas projects the same",
+        "read",
+        lambda folder: write_boreas(GoldenScene(), folder),
+        "one for all drives of a route",
+    ),
 ]
 
 
@@ -414,7 +459,7 @@ def test_datasets_come_in_as_the_table_says(row, tmp_path):
     dataset = read_dataset(path, distortion="undistort")
     assert len(dataset.pictures) == 3
     assert re.search(row.said, "\n".join(dataset.changes))
-    assert dataset.pictures[0].read().shape == (48, 64, 3)
+    assert dataset.pictures[0].read().shape == row.shape
 
 
 def table() -> str:

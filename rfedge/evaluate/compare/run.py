@@ -99,7 +99,7 @@ def _inputs(job: EvalCompare) -> list[Path]:
     shown = [drive.name.dataset for drive in drives]
     shown += [DriveName.parse(text).dataset for text in job.background]
     # Of a folder the file that describes it; a bag is no such file, and long to read.
-    files = [read_source(p).file if p.is_dir() and not is_bag(p) else p for p in shown]
+    files = [p if p.is_file() or is_bag(p) else read_source(p).file for p in shown]
     named = [*(str(drive.field) for drive in drives), *job.method]
     return list(dict.fromkeys([*(module_file(each) or Path(each) for each in named), *files]))
 
