@@ -27,7 +27,7 @@ from rfcore.pixels import EXACT_CONVERSION, Pixels, pixels_of
 Rgb = NDArray[np.uint8]
 Plane = NDArray[np.uint8]
 
-DISPLAY_P3, SRGB_TRANSFER = 12, 13
+SRGB_TRANSFER = 13
 UNSPECIFIED_MATRIX = 2
 """ITU-T H.273's codes."""
 HD_LINES = 720
@@ -151,14 +151,14 @@ def read_rgb(path: Path) -> Rgb:
     return read_pixels(path).rgb
 
 
-def read_pixels(path: Path, *, is_p3: bool = False) -> Pixels:
+def read_pixels(path: Path, *, primaries: int | None = None) -> Pixels:
     """Read a picture file with what is opaque of it; raise as ``read_rgb``.
 
-    ``is_p3``: its profile, which FFmpeg does not read, is Display P3.
+    ``primaries`` (ITU-T H.273): those of its profile, which FFmpeg does not read.
     """
     frame = read_frame(path)
-    if is_p3:
-        frame.color_primaries, frame.color_trc = DISPLAY_P3, SRGB_TRANSFER
+    if primaries is not None:
+        frame.color_primaries, frame.color_trc = primaries, SRGB_TRANSFER
     return pixels_of(frame, str(path))
 
 

@@ -2,38 +2,43 @@
 
 A picture is read as it is stored or, where only that fits its camera, turned as its EXIF
 orientation says: COLMAP, instant-ngp and nerfstudio know nothing of EXIF. Its mask is the file that
-the dataset names, or one beside the pictures: ``masks/NAME.png`` or ``masks/STEM.png`` next to the
-folder ``images`` (COLMAP, gsplat, LichtFeld Studio), or instant-ngp's ``dynamic_mask_STEM.png``.
+the dataset names, or one beside the pictures: ``masks/NAME.png``, ``masks/STEM.png`` or
+``masks/STEM_mask.png`` next to the folder ``images`` (COLMAP, gsplat, LichtFeld Studio, Metashape),
+``NAME.mask.png``, ``STEM.mask.png`` or ``STEM_mask.png`` in the picture's folder (RealityScan,
+OpenDroneMap), or instant-ngp's ``dynamic_mask_STEM.png``.
 White is learnt and measured, black is not, but for instant-ngp's masks, which are white where
 something moves. A transparent pixel is not learnt either.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rfcore.camera import MAX_SIDE_PX, Intrinsics
+from rfcore.dataset.colour_profile import OTHER_PROFILE, PRIMARIES
 from rfcore.dataset.orientation import Orientation
 from rfcore.dataset.picture_header import (
-    OTHER_PROFILE,
-    P3,
     UNREAD,
     jpeg_segments,
     picture_format,
     picture_header,
 )
 from rfcore.errors import DatasetError
-from rfcore.image import Rgb, read_pixels
+from rfcore.image import Rgb, read_frame, read_pixels
 from rfcore.pixels import Pixels
 from rfcore.tables import shortened
 from rfcore.views import Mask
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG", ".WEBP")
 """Suffixes that a name without one may stand for."""
+MASK_FOLDERS, MASK_SUFFIXES = ("masks", "mask", "Masks"), (*SUFFIXES, ".tif", ".tiff")
 MAX_PART_BYTES = 255
 """Longest file name of Linux file systems."""
 JPEG_SCAN = 0xDA
@@ -112,7 +117,7 @@ class PictureFile:
     intrinsics: Intrinsics
     orientation: Orientation
     has_alpha: bool
-    is_p3: bool
+    primaries: int | None
     mask_file: MaskFile | None
     notes: tuple[str, ...]
 
@@ -146,9 +151,9 @@ class PictureFile:
         mask = mask or mask_beside(path)
         if mask is not None:
             notes.append("have a mask: what it hides is not learnt or measured")
-        is_p3 = header.profile == P3
+        primaries = PRIMARIES.get(header.profile or "")
         return PictureFile(
-            path, intrinsics, orientation, header.has_alpha, is_p3, mask, tuple(notes)
+            path, intrinsics, orientation, header.has_alpha, primaries, mask, tuple(notes)
         )
 
     @property
@@ -164,7 +169,7 @@ class PictureFile:
         PictureFile.of(self.path, self.intrinsics, self.mask_file)  # it may have been replaced
         _require_length(self.path, self.intrinsics)
         _require_whole_jpeg(self.path)
-        pixels = read_pixels(self.path, is_p3=self.is_p3)
+        pixels = read_pixels(self.path, primaries=self.primaries)
         height, width, _ = pixels.rgb.shape
         require_size(self.path, self.orientation.size((width, height)), self.intrinsics)
         return pixels
@@ -193,7 +198,7 @@ class MaskFile:
         """
         width, height = picture_header(self.path).size_px
         _require_length(self.path, replace(picture.intrinsics, width_px=width, height_px=height))
-        values = read_pixels(self.path).rgb.max(axis=2)
+        values = self._values()
         is_white = np.asarray(values > values.max() / 2)
         k = picture.intrinsics
         if is_white.shape != (k.height_px, k.width_px):
@@ -205,20 +210,44 @@ class MaskFile:
             )
         return np.asarray(is_white != self.hides_white)
 
+    def _values(self) -> NDArray[np.integer[Any]]:
+        """Return the brightness [H, W]: of 16 bits as they are, of one colour its alpha."""
+        frame = read_frame(self.path)
+        if frame.format.name in ("gray16be", "gray16le"):
+            return np.asarray(frame.to_ndarray())
+        pixels = read_pixels(self.path)
+        values = np.asarray(pixels.rgb.max(axis=2))
+        if pixels.opaque is not None and values.min() == values.max():
+            return pixels.opaque.astype(np.uint8)
+        return values
+
 
 def mask_beside(path: Path) -> MaskFile | None:
     """Return the mask that lies beside a picture, ``None`` without one."""
     moving = path.with_name(f"dynamic_mask_{path.stem}.png")
     if moving.is_file():
         return MaskFile(moving, hides_white=True)
-    if path.parent.name == "masks":
+    if path.parent.name in MASK_FOLDERS:
         return None
-    for folder in path.parents[:3]:
-        masks = folder.parent / "masks" / path.parent.relative_to(folder)
-        for name in (f"{path.name}.png", *(path.stem + suffix for suffix in SUFFIXES)):
-            if masks.is_dir() and (masks / name).is_file():
-                return MaskFile(masks / name)
+    beside = (f"{path.name}.mask.png", f"{path.stem}.mask.png", f"{path.stem}_mask.png")
+    for name in beside:
+        if (path.parent / name).is_file():
+            return MaskFile(path.parent / name)
+    stems = (path.name, path.stem, f"{path.stem}_mask")
+    for folder, masks_name in product(path.parents[:3], MASK_FOLDERS):
+        masks = folder.parent / masks_name / path.parent.relative_to(folder)
+        for stem, suffix in product(stems, MASK_SUFFIXES if masks.is_dir() else ()):
+            if (masks / f"{stem}{suffix}").is_file():
+                return MaskFile(masks / f"{stem}{suffix}")
     return None
+
+
+def _is_mask(path: Path, names: Container[str]) -> bool:
+    """Return whether a file of a folder is the mask of another one of the same folder."""
+    if path.name.startswith("dynamic_mask_"):
+        return True
+    stem = path.stem.removesuffix(".mask").removesuffix("_mask")
+    return stem != path.stem and (stem in names or any(stem + s in names for s in SUFFIXES))
 
 
 def picture_paths(folder: Path) -> list[Path]:
@@ -230,7 +259,8 @@ def picture_paths(folder: Path) -> list[Path]:
         raise DatasetError(f"{folder}: is neither a folder of pictures nor a video that is read")
     files = sorted(path for path in folder.glob("*") if path.is_file())
     formats = {path: picture_format(path) for path in files}
-    paths = [path for path in files if formats[path] and "dynamic_mask_" not in path.name]
+    names = {path.name for path in files}
+    paths = [path for path in files if formats[path] and not _is_mask(path, names)]
     if not paths:
         raise DatasetError(f"{folder}: holds no pictures (PNG, JPEG, WebP, TIFF, OpenEXR, ...)")
     unread = [path for path in paths if formats[path] in UNREAD]

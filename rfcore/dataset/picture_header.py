@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
 
+from rfcore.dataset.colour_profile import PRIMARIES, profile_of
 from rfcore.dataset.orientation import Orientation
 from rfcore.errors import DatasetError
 from rfcore.image import read_frame
@@ -38,10 +39,13 @@ SIGNATURES = {
 UNREAD = ("JPEG XL", "HEIC")
 HEIC = (b"heic", b"heix", b"heim", b"heis", b"mif1")
 START_BYTES = 32
-EXIF_START = b"Exif\0\0"
-ORIENTATION_TAG = 0x0112
+EXIF_START, ICC_START = b"Exif\0\0", b"ICC_PROFILE\0"
+ORIENTATION_TAG, COMPRESSION_TAG, PROFILE_TAG = 0x0112, 0x0103, 0x8773
+JPEG_COMPRESSIONS = (6, 7)
+SHORT, FIELD_BYTES = 3, 12
+"""TIFF's type of 16 bits, and the length of an entry of a directory."""
+ALPHA_ITEM, PROFILE_BOX = b"urn:mpeg:mpegB:cicp:systems:auxiliary:alpha", b"colrprof"
 MAX_CHUNKS = 1000
-P3, OTHER_PROFILE = "Display P3", "other"
 MAX_PROFILE_BYTES = 1 << 16
 LINEAR_GAMMA, PQ, HLG = 100_000, 16, 18
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -58,7 +62,7 @@ class PictureHeader:
     orientation: Orientation = Orientation.UPRIGHT
     treatment: str | None = None
     profile: str | None = None
-    """``P3``, ``OTHER_PROFILE``, or ``None`` for sRGB and where there is none."""
+    """As ``rfcore.dataset.colour_profile.profile_of`` names it."""
 
 
 def picture_format(path: Path) -> str | None:
@@ -90,10 +94,41 @@ def picture_header(path: Path) -> PictureHeader:
     if header is not None:
         return header
     frame = read_frame(path)
-    size_px = (frame.width, frame.height)
-    return PictureHeader(
-        found or "picture", size_px, has_alpha(frame.format), treatment=treatment(frame)
-    )
+    size_px, alpha = (frame.width, frame.height), has_alpha(frame.format)
+    orientation, profile = Orientation.UPRIGHT, b""
+    if found == "TIFF":
+        orientation, profile = _tiff(path)
+    elif found == "AVIF":
+        profile = _avif_profile(path)
+    said = _profiled(treatment(frame), profile)
+    return PictureHeader(found or "picture", size_px, alpha, orientation, *said)
+
+
+def _tiff(path: Path) -> tuple[Orientation, bytes]:
+    """Return a TIFF's orientation and ICC profile; raise ``DatasetError`` for JPEG inside it, of
+    which FFmpeg shows wrong colours."""
+    data = path.read_bytes()
+    tags = _directory(data)
+    if tags.get(COMPRESSION_TAG, (0, 0, 0))[2] in JPEG_COMPRESSIONS:
+        raise DatasetError(
+            f"{path}: JPEG compression inside TIFF is not read; export the picture as JPEG or PNG"
+        )
+    _, length, at = tags.get(PROFILE_TAG, (0, 0, 0))
+    return _orientation(data), data[at : at + min(length, MAX_PROFILE_BYTES)]
+
+
+def _avif_profile(path: Path) -> bytes:
+    """Return an AVIF's ICC profile; raise ``DatasetError`` for one with alpha, which FFmpeg leaves
+    out."""
+    with path.open("rb") as file:
+        start = file.read(MAX_PROFILE_BYTES)
+    if ALPHA_ITEM in start:
+        raise DatasetError(
+            f"{path}: AVIF with alpha is not read; export the picture as PNG or WebP"
+        )
+    at = start.find(PROFILE_BOX)
+    length = int.from_bytes(start[max(at - 4, 0) : at]) - 12
+    return start[at + len(PROFILE_BOX) :][:length] if at >= 0 < length else b""
 
 
 def _none(_: BinaryIO) -> None:
@@ -110,15 +145,16 @@ def _png(file: BinaryIO) -> PictureHeader | None:
         said = "linear"
     coding = chunks.get(b"cICP", b"\0\0")[1:2]
     said = {bytes([PQ]): "PQ", bytes([HLG]): "HLG"}.get(coding, said)
-    name, _, data = chunks.get(b"iCCP", b"").partition(b"\0")
+    _, _, data = chunks.get(b"iCCP", b"").partition(b"\0")
+    profile = b""
     with suppress(zlib.error):
-        name += zlib.decompressobj().decompress(data[1:], MAX_PROFILE_BYTES)
+        profile = zlib.decompressobj().decompress(data[1:], MAX_PROFILE_BYTES)
     return PictureHeader(
         "PNG",
         (int.from_bytes(start[:4]), int.from_bytes(start[4:8])),
         start[9:10] in (b"\4", b"\6") or b"tRNS" in chunks,
         _orientation(chunks.get(b"eXIf", b"")),
-        *_profiled(said, name),
+        *_profiled(said, profile),
     )
 
 
@@ -140,8 +176,8 @@ def _jpeg(file: BinaryIO) -> PictureHeader | None:
         if marker in (0xE1, 0xE2):
             length = int.from_bytes(file.read(2)) - 2
             data = file.read(max(length, 0))
-            if data.startswith(b"ICC_PROFILE\0"):
-                profile += data
+            if data.startswith(ICC_START):
+                profile += data[len(ICC_START) + 2 :]  # behind its number and their count
             if data.startswith(EXIF_START):
                 orientation = _orientation(data[len(EXIF_START) :])
         if marker in JPEG_FRAMES:
@@ -199,24 +235,28 @@ def _webp_chunk(file: BinaryIO, name: bytes) -> bytes:
 
 
 def _profiled(treatment: str | None, profile: bytes) -> tuple[str | None, str | None]:
-    """Return what is done to the colours, and what an ICC profile's text says that it is."""
-    text = profile.replace(b"\0", b"")
-    if not text or b"sRGB" in text:
-        return treatment, None
-    if b"Display P3" in text:
-        return treatment or "in Display P3", P3
-    return treatment, OTHER_PROFILE
+    """Return what is done to the colours, and what an ICC profile says that they are."""
+    found = profile_of(profile)
+    return (treatment or f"in {found}" if found in PRIMARIES else treatment), found
 
 
 def _orientation(exif: bytes) -> Orientation:
     """Return the orientation of a TIFF header with its first directory; upright without one."""
-    if exif[:2] not in (b"II", b"MM"):
-        return Orientation.UPRIGHT
-    ends: Literal["little", "big"] = "little" if exif[:2] == b"II" else "big"
-    at = int.from_bytes(exif[4:8], ends)
-    for entry in range(int.from_bytes(exif[at : at + 2], ends)):
-        field = exif[at + 2 + 12 * entry : at + 14 + 12 * entry]
-        if int.from_bytes(field[:2], ends) == ORIENTATION_TAG:
-            number = int.from_bytes(field[8:10], ends)
-            return Orientation(number) if 1 <= number <= 8 else Orientation.UPRIGHT
-    return Orientation.UPRIGHT
+    _, _, number = _directory(exif).get(ORIENTATION_TAG, (0, 0, 1))
+    return Orientation(number) if 1 <= number <= 8 else Orientation.UPRIGHT
+
+
+def _directory(tiff: bytes) -> dict[int, tuple[int, int, int]]:
+    """Return type, count and value (or where it lies) of each tag of a TIFF's first directory."""
+    if tiff[:2] not in (b"II", b"MM"):
+        return {}
+    ends: Literal["little", "big"] = "little" if tiff[:2] == b"II" else "big"
+    at = int.from_bytes(tiff[4:8], ends)
+    tags = {}
+    for entry in range(int.from_bytes(tiff[at : at + 2], ends)):
+        first = at + 2 + FIELD_BYTES * entry
+        field = tiff[first : first + FIELD_BYTES]
+        tag, kind = (int.from_bytes(field[k : k + 2], ends) for k in (0, 2))
+        value = field[8:10] if kind == SHORT else field[8:12]
+        tags[tag] = (kind, int.from_bytes(field[4:8], ends), int.from_bytes(value, ends))
+    return tags

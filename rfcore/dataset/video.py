@@ -233,7 +233,7 @@ def _index(file: Path) -> VideoIndex:
         if aspect and aspect != 1:
             notes.append(f"pixels are {float(aspect):.4g} times as wide as high: taken as stored")
         if not is_stated:
-            rate = _rate_hz(file, stream)
+            rate = _rate_hz(file, stream, len(pts))
             notes.append(f"frames state no times in order: {float(rate):g} a second are taken")
     size_px = (first.width, first.height)
     return VideoIndex(
@@ -283,15 +283,18 @@ def _times_ns(
     if len(stated) == len(pts) and all(a < b for a, b in pairwise(stated)):
         tick_ns = (stream.time_base or Fraction(1, 90_000)) * 1_000_000_000
         return tuple(round((tick - stated[0]) * tick_ns) for tick in stated), True
-    period_ns = 1_000_000_000 / _rate_hz(file, stream)
+    period_ns = 1_000_000_000 / _rate_hz(file, stream, len(pts))
     return tuple(round(number * period_ns) for number in range(len(pts))), False
 
 
-def _rate_hz(file: Path, stream: VideoStream) -> Fraction:
+def _rate_hz(file: Path, stream: VideoStream, count: int) -> Fraction:
+    """Return the stated rate, or that of ``count`` frames in the stated length where that is less
+    than half of it: an AVI copied from MP4 states its time base as its rate."""
     rate = stream.average_rate or stream.guessed_rate
     if not rate:
         raise DatasetError(f"{file}: states neither times of frames nor a rate")
-    return rate
+    length_s = (stream.duration or 0) * (stream.time_base or Fraction(0))
+    return count / length_s if 2 * count < rate * length_s else rate
 
 
 def _orientation(file: Path, frame: av.VideoFrame) -> Orientation:

@@ -19,9 +19,9 @@ splat smaller than a pixel is made fainter) or ``SplatRenderMode: default``, as 
 Postshot's ``antialiased 0`` or ``1`` is read as well. Which way is up is a comment of our own,
 ``rfedge up: X Y Z``, a unit vector.
 
-Two properties that change what the others mean are refused by name rather than ignored:
-``filter_3D`` of Mip-Splatting (its own ``create_fused_ply.py`` fuses it in), and two scales
-instead of three (2D Gaussian Splatting's discs).
+Properties that change what the others mean are refused by name rather than ignored: ``filter_3D``
+of Mip-Splatting (its own ``create_fused_ply.py`` fuses it in), two scales instead of three (2D
+Gaussian Splatting's discs), and those of motion (``MOVING``).
 """
 
 from __future__ import annotations
@@ -61,6 +61,8 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 MODES = {"splatrendermode:mip": True, "splatrendermode:default": False}
 """Comments without their spaces, in lower case, and whether splats are drawn antialiased."""
+MOVING = re.compile(r"scale_t|motion_\d+|trbf_\w+|omega_\d+|rot_r_\d+")
+"""Properties of splats that move: those of SpacetimeGaussians and of 4D Gaussian Splatting."""
 POSTSHOT_MODES = {"antialiased1": True, "antialiased0": False}
 
 UP = "rfedge up:"
@@ -129,6 +131,12 @@ def _refuse_others(path: Path, vertex: Element) -> None:
     if "filter_3D" in names:
         raise FieldFormatError(
             f"{path}: has filter_3D of Mip-Splatting; fuse it with its create_fused_ply.py first"
+        )
+    moving = [name for name in names if MOVING.fullmatch(name)]
+    if moving:
+        raise FieldFormatError(
+            f"{path}: holds splats that move ({moving[0]}), which are not read; export one instant "
+            "of them as a static .ply"
         )
     missing = [name for name in ("opacity", *SCALES, *ROTATION) if name not in names]
     if len(missing) == 1 + len(SCALES) + len(ROTATION):

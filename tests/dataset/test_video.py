@@ -111,6 +111,20 @@ def test_each_container_gives_the_times_of_its_frames(videos, name):
     assert bool(said) == (name in TIMELESS)
 
 
+def test_an_avi_of_copied_packets_has_the_rate_of_its_length(videos, tmp_path):
+    """Its header states the time base for a rate, as `ffmpeg -c copy` writes it."""
+    path = tmp_path / "copy.avi"
+    with av.open(str(videos / "a.ts")) as source, av.open(str(path), "w") as container:
+        stream = container.add_stream_from_template(source.streams.video[0])
+        stream.time_base = Fraction(1, 600)
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                container.mux(packet)
+    times_s = np.array(Video(path).index.times_ns) / 1e9
+    np.testing.assert_allclose(np.diff(times_s), 1 / RATE, rtol=0.1)
+
+
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_video_is_known_by_its_content(videos, name, tmp_path):
     (tmp_path / "drive.txt").write_bytes((videos / name).read_bytes())

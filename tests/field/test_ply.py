@@ -96,6 +96,8 @@ def edited(path: Path, old: str, new: str) -> None:
         ("binary_little_endian 1.0", "binary_little_endian 2.0", "1.0 is needed"),
         ("element vertex 4", "element chunk 1", "no chunk property min_x"),
         ("property float nx", "property float filter_3D", "create_fused_ply"),
+        ("property float nx", "property float motion_0", "splats that move .motion_0., which"),
+        ("property float nx", "property float scale_t", "splats that move .scale_t., which"),
         ("ply\n", "plx\n", "is no .ply, .spz or .glb by its content: it begins with b'plx"),
         ("end_header", "end_of_it", "no 'end_header'|not a scalar"),
         ("element vertex 4", "element vertex many", "does not state a count"),
