@@ -228,7 +228,17 @@ def _points(file: Path, content: Table, notes: list[str]) -> SourcePoints | None
     if path is None:
         notes.append(f"no points: {name}, which {file.name} names, is missing")
         return None
-    return read_points(path)
+    return _readable_points(path, notes)
+
+
+def _readable_points(path: Path, notes: list[str]) -> SourcePoints | None:
+    """Return a file's points; without them, and with a note, where it cannot be read: pictures and
+    poses do without."""
+    try:
+        return read_points(path)
+    except DatasetError as error:
+        notes.append(f"no points: {error}")
+        return None
 
 
 def read_inria_source(file: Path) -> Source:
@@ -237,8 +247,9 @@ def read_inria_source(file: Path) -> Source:
     if not isinstance(entries, list) or not entries:
         raise DatasetError(f"{file}: must be a list of at least one camera")
     pictures = tuple(_inria_picture(file, i, entry) for i, entry in enumerate(entries))
-    points = file.parent / "input.ply"
-    return Source(file, pictures, read_points(points) if points.is_file() else None)
+    path, notes = file.parent / "input.ply", list[str]()
+    points = _readable_points(path, notes) if path.is_file() else None
+    return Source(file, pictures, points, notes=tuple(notes))
 
 
 def _inria_picture(file: Path, index: int, entry: Any) -> SourcePicture:

@@ -101,14 +101,20 @@ FULL = {"u1": 255, "u2": 65_535, "f4": 1, "f8": 1}
 
 
 def read_points(path: Path) -> SourcePoints:
-    """Read x, y, z in metres and the colour of every vertex; grey where it has none.
+    """Read x, y, z in metres and the colour of every finite vertex; grey where it has none.
 
     Raises ``DatasetError`` naming the file.
     """
     try:
         table = read_vertices(path, ("x", "y", "z"))
         xyz_m = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-        return SourcePoints(xyz_m, *_rgb(path, table))
+        rgb, note = _rgb(path, table)
+        is_finite = np.isfinite(xyz_m).all(axis=1)
+        if not is_finite.all():
+            bad = int((~is_finite).sum())
+            said = f"{path}: {bad} of {len(xyz_m)} points are not finite and left out"
+            note = f"{note}; {said}" if note else said
+        return SourcePoints(xyz_m[is_finite], rgb[is_finite], note)
     except (FieldFormatError, InvalidInput) as error:
         raise DatasetError(f"points of {path}: {error}") from error
 

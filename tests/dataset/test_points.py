@@ -1,8 +1,12 @@
 """Points of a PLY file: colours of any kind or none; damaged ones name the file."""
 
+import json
+
+import cv2
 import numpy as np
 import pytest
 
+from rfcore.dataset import read_dataset
 from rfcore.dataset.source import read_points
 from rfcore.errors import DatasetError
 
@@ -20,7 +24,6 @@ HEADER = (
         (HEADER.format(n=2_000_000_000, colour="uchar"), bytes(15), "30000000000 bytes"),
         (HEADER.format(n=1, colour="int"), bytes(30), "must be uchar"),
         (HEADER.format(n=1, colour="uchar").replace(" z", " w"), bytes(15), "no vertex.* z"),
-        (HEADER.format(n=1, colour="uchar"), b"\0\0\xc0\x7f" + bytes(11), "not finite"),
     ],
 )
 def test_damaged_points_are_refused(tmp_path, header, rows, named):
@@ -28,6 +31,28 @@ def test_damaged_points_are_refused(tmp_path, header, rows, named):
     file.write_bytes(header.encode() + rows)
     with pytest.raises(DatasetError, match=rf"points\.ply.*{named}"):
         read_points(file)
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path):
+    file = tmp_path / "points.ply"
+    rows = b"\0\0\xc0\x7f" + bytes(11) + bytes(12) + b"\1\2\3"
+    file.write_bytes(HEADER.format(n=2, colour="uchar").encode() + rows)
+    points = read_points(file)
+    assert points.rgb.tolist() == [[1, 2, 3]]
+    assert points.note == f"{file}: 1 of 2 points are not finite and left out"
+
+
+@pytest.mark.parametrize("points", [b"", b"ply\nformat ascii 1.0\n", b"# .PCD v0.7\n"])
+def test_a_dataset_is_read_without_points_that_cannot_be(tmp_path, points):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((6, 8, 3), np.uint8))
+    (tmp_path / "points.ply").write_bytes(points)
+    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
+    k = {"fl_x": 8, "fl_y": 8, "cx": 4, "cy": 3, "w": 8, "h": 6, "ply_file_path": "points.ply"}
+    (tmp_path / "transforms.json").write_text(json.dumps({**k, "frames": frames}))
+    dataset = read_dataset(tmp_path)
+    assert len(dataset.pictures) == 1
+    assert dataset.points is None
+    assert any("no points: points of" in change for change in dataset.changes)
 
 
 @pytest.mark.parametrize(
