@@ -3,8 +3,8 @@
 Coordinates are normalised: (x, y) = (X / Z, Y / Z) in camera axes, so that a pinhole's pixel is
 ``(fx x + cx, fy y + cy)``. ``distort`` maps the direction of a point to where the lens puts it,
 ``undistort`` is its inverse. Two models, with the coefficients' meaning of OpenCV 4 (calib3d) and
-COLMAP, which agree: ``BrownLens`` (Brown-Conrady, OPENCV) and ``FisheyeLens`` (Kannala-Brandt,
-OPENCV_FISHEYE).
+COLMAP, which agree: ``BrownLens`` (Brown-Conrady, OPENCV and FULL_OPENCV) and ``FisheyeLens``
+(Kannala-Brandt, OPENCV_FISHEYE).
 
 A polynomial is a lens only up to the radius where it turns back; beyond it two directions would
 share one pixel. ``max_radius`` says where that is. A camera without distortion is a plain
@@ -19,6 +19,7 @@ from dataclasses import astuple, dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from rfcore.camera import Intrinsics, Pose
@@ -49,13 +50,14 @@ class Lens(Protocol):
 
 @dataclass(frozen=True)
 class BrownLens:
-    """Radial k1, k2, k3 and tangential p1, p2 (OpenCV's order is k1 k2 p1 p2 k3).
+    """Radial k1 to k6, tangential p1, p2, thin prism s1 to s4; OpenCV's order is k1 k2 p1 p2 k3 k4
+    k5 k6 s1 s2 s3 s4.
 
     ::
 
-        r2 = x^2 + y^2;   g = 1 + k1 r2 + k2 r2^2 + k3 r2^3
-        x' = g x + 2 p1 x y + p2 (r2 + 2 x^2)
-        y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y
+        r2 = x^2 + y^2;   g = (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3)
+        x' = g x + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r2^2
+        y' = g y + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r2^2
     """
 
     k1: float = 0.0
@@ -63,23 +65,47 @@ class BrownLens:
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    s1: float = 0.0
+    s2: float = 0.0
+    s3: float = 0.0
+    s4: float = 0.0
 
     def __post_init__(self) -> None:
         _check_finite(self)
 
     @property
     def max_radius(self) -> float:
-        """The radius where r g(r) stops growing: the least positive root of its derivative."""
-        return math.sqrt(_least_positive_root((1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3)))
+        """The radius where r g(r) stops growing or has a pole: the least positive root of its
+        derivative's numerator (n + 2 s n') d - 2 s n d', or of d, in s = r^2."""
+        n, d = Polynomial((1.0, self.k1, self.k2, self.k3)), self._denominator
+        growth = Polynomial((1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3))
+        slope = growth * d - Polynomial((0.0, 2.0)) * n * d.deriv()
+        return math.sqrt(min(_least_positive_root(each) for each in (slope, d)))
+
+    @property
+    def _denominator(self) -> Polynomial:
+        return Polynomial((1.0, self.k4, self.k5, self.k6))
 
     def distort(self, xy: F64) -> F64:
         """Map directions [N, 2] to sensor coordinates [N, 2]."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
-        g = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        g, _ = self._gain(r2)
         xd = g * x + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
         yd = g * y + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+        xd, yd = xd + r2 * (self.s1 + r2 * self.s2), yd + r2 * (self.s3 + r2 * self.s4)
         return np.stack([xd, yd], axis=1)
+
+    def _gain(self, r2: F64) -> tuple[F64, F64]:
+        """Return g and its derivative by r2."""
+        below = 1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+        g = (1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))) / below
+        slope = self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3)
+        slope_below = self.k4 + r2 * (2 * self.k5 + r2 * 3 * self.k6)
+        return g, (slope - g * slope_below) / below
 
     def undistort(self, xy: F64) -> F64:
         """Invert by Newton's method; raises ``InvalidInput`` when a point has no direction."""
@@ -95,18 +121,20 @@ class BrownLens:
         return found
 
     def _newton_step(self, xy: F64, residual: F64) -> F64:
-        """Solve J step = residual; J is symmetric."""
+        """Solve J step = residual."""
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
-        g = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        slope = self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3)
+        g, slope = self._gain(r2)
         xx = g + 2 * x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
-        xy_ = 2 * x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y
+        both = 2 * x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y
         yy = g + 2 * y * y * slope + 6 * self.p1 * y + 2 * self.p2 * x
-        det = xx * yy - xy_ * xy_
+        prism_x, prism_y = 2 * (self.s1 + 2 * r2 * self.s2), 2 * (self.s3 + 2 * r2 * self.s4)
+        xx, xy_ = xx + prism_x * x, both + prism_x * y
+        yx, yy = both + prism_y * x, yy + prism_y * y
+        det = xx * yy - xy_ * yx
         det = np.where(np.abs(det) < 1e-9, 1e-9, det)
         rx, ry = residual[:, 0], residual[:, 1]
-        return np.stack([(yy * rx - xy_ * ry) / det, (xx * ry - xy_ * rx) / det], axis=1)
+        return np.stack([(yy * rx - xy_ * ry) / det, (xx * ry - yx * rx) / det], axis=1)
 
 
 @dataclass(frozen=True)
@@ -129,7 +157,9 @@ class FisheyeLens:
     @property
     def max_angle_rad(self) -> float:
         """The largest angle to the axis that is used: where r' stops growing, at most pi / 2."""
-        t2 = _least_positive_root((1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4))
+        t2 = _least_positive_root(
+            Polynomial((1.0, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4))
+        )
         return min(math.sqrt(t2), math.pi / 2)
 
     @property
@@ -199,9 +229,9 @@ def _check_finite(lens: BrownLens | FisheyeLens) -> None:
         raise InvalidInput("lens", f"{lens} has a coefficient that is not finite")
 
 
-def _least_positive_root(ascending: Sequence[float]) -> float:
+def _least_positive_root(polynomial: Polynomial) -> float:
     """Return the least root > 0 of a polynomial, infinity if it has none."""
-    roots = np.polynomial.Polynomial(ascending).trim().roots()
+    roots = polynomial.trim().roots()
     real = roots[np.abs(np.imag(roots)) < 1e-9].real
     return float(min(real[real > 0], default=math.inf))
 

@@ -1,6 +1,7 @@
 """Lenses agree with OpenCV's definition, are inverted exactly, and say where they end."""
 
 import math
+from dataclasses import astuple
 
 import cv2
 import numpy as np
@@ -15,7 +16,8 @@ from rfcore.lens import BrownLens, FisheyeLens, Lens, LensCamera
 FOX = BrownLens(k1=0.0578421, k2=-0.0805099, p1=-0.000980296, p2=0.00015575)
 BARREL = BrownLens(k1=-0.28, k2=0.07, p1=2e-4, p2=3e-5, k3=-0.01)
 FISHEYE = FisheyeLens(k1=-0.02, k2=0.004, k3=-0.003, k4=0.0005)
-LENSES: list[Lens] = [FOX, BARREL, FISHEYE, FisheyeLens()]
+RATIONAL = BrownLens(0.4, 0.1, 0.01, -0.02, 0.02, 0.6, 0.15, 0.03, 0.03, 0.01, -0.04, 0.02)
+LENSES: list[Lens] = [FOX, BARREL, RATIONAL, FISHEYE, FisheyeLens()]
 
 direction = st.tuples(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7))
 
@@ -25,10 +27,10 @@ def grid() -> np.ndarray:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-@pytest.mark.parametrize("lens", [FOX, BARREL])
+@pytest.mark.parametrize("lens", [FOX, BARREL, RATIONAL])
 def test_brown_is_opencv(lens):
     points = np.concatenate([grid(), np.ones((225, 1))], axis=1)
-    coefficients = np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
+    coefficients = np.array(astuple(lens))
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
     np.testing.assert_allclose(lens.distort(grid()), expected[:, 0], atol=1e-13)
 
@@ -61,6 +63,8 @@ def test_a_lens_ends_where_it_turns_back():
     with pytest.raises(InvalidInput, match="not one-to-one"):
         lens.undistort(np.array([[0.7, 0.0]]))
     assert BrownLens(k1=0.1).max_radius == math.inf
+    assert BrownLens(k4=1.0).max_radius == pytest.approx(1.0)  # r / (1 + r^2)
+    assert BrownLens(k4=-0.25).max_radius == pytest.approx(2.0)  # a pole
     assert FisheyeLens().max_radius == math.inf
     assert FisheyeLens(k1=-1 / 3).max_radius == pytest.approx(math.tan(1.0))
     with pytest.raises(InvalidInput, match="not one-to-one"):

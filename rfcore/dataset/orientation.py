@@ -107,7 +107,11 @@ class Orientation(IntEnum):
         centre_px = (a * x + b * y + width_px / 2, c * x + d * y + height_px / 2)
         lens = camera.lens
         if isinstance(lens, BrownLens):
-            lens = replace(lens, p2=a * lens.p2 + b * lens.p1, p1=c * lens.p2 + d * lens.p1)
+            turned: dict[str, float] = {}
+            for along, down in (("p2", "p1"), ("s1", "s3"), ("s2", "s4")):
+                x, y = getattr(lens, along), getattr(lens, down)
+                turned |= {along: a * x + b * y, down: c * x + d * y}
+            lens = replace(lens, **turned)
         return SourceCamera(Intrinsics(width_px, height_px, *focal_px, *centre_px), lens)
 
     @property

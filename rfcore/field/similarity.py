@@ -2,7 +2,8 @@
 
 ``p_dst = scale * rotation @ p_src + translation_m``. Means, widths, rotations and colours of the
 Gaussians change; colours, because spherical harmonics are functions of the direction in the field's
-frame. It is done in float64, once, when a field is imported.
+frame. It is done in float64 by elementwise additions, multiplications and square roots (no BLAS),
+so that a field moved without a scale is the same on every machine.
 
 nerfstudio's ``dataparser_transforms.json`` says how it normalised the scene that a ``.ply`` was
 trained in: ``{"transform": 3x4, "scale": s}`` with p_field = s * (transform @ (p_world, 1)). The
@@ -16,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.random import default_rng
 from numpy.typing import NDArray
 
 from rfcore.camera import Pose, TileOrigin
@@ -25,8 +25,6 @@ from rfcore.harmonics import SH_DC, higher_harmonics
 from rfcore.raster.gaussians import F32, Gaussians
 
 F64 = NDArray[np.float64]
-DIRECTIONS = 64
-"""Sample directions for the rotation of SH, which has at most 7 unknowns a row."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class Similarity:
 
     def apply(self, points: F64) -> F64:
         """Map points [N, 3] from src to dst."""
-        turned = points @ self.rotation.T
+        turned = _mapped(points, self.rotation)
         return np.asarray(self.scale * turned + np.array(self.pose.translation_m))
 
 
@@ -94,23 +92,53 @@ def turned_rotations(quaternions: F32, by: tuple[float, float, float, float]) ->
     """Return ``by`` times each quaternion [N, 4] (w, x, y, z); norms stay."""
     w, x, y, z = by
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return np.ascontiguousarray(quaternions.astype(np.float64) @ left.T, np.float32)
+    return np.ascontiguousarray(_mapped(quaternions.astype(np.float64), left), np.float32)
 
 
 def turned_sh(sh: F32, rotation: F64) -> F32:
     """Return the coefficients [N, K, 3] of colours rotated with the field.
 
-    Each band is closed under rotation; its matrix is solved from its values in many directions.
+    Each band is closed under rotation. Its matrix is the integral over the sphere of a product of
+    two harmonics of the band, which a sum over few directions is equal to.
     """
     turned = sh.copy()
-    directions = default_rng(0).normal(size=(DIRECTIONS, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    here, there = spherical_harmonics(directions), spherical_harmonics(directions @ rotation)
+    directions, weights = _quadrature()
+    here = spherical_harmonics(directions)
+    there = spherical_harmonics(_mapped(directions, rotation))
     for degree in range(1, round(sh.shape[1] ** 0.5)):
         band = slice(degree**2, (degree + 1) ** 2)
-        matrix = np.linalg.lstsq(here[:, band], there[:, band], rcond=None)[0]
-        turned[:, band] = np.einsum("ij,njc->nic", matrix, sh[:, band].astype(np.float64))
+        matrix = _mapped((there[:, band] * weights[:, None]).T, here[:, band].T)
+        coloured = sh[:, band].astype(np.float64)
+        for channel in range(3):
+            turned[:, band, channel] = _mapped(coloured[..., channel], matrix)
     return turned
+
+
+def _mapped(vectors: F64, matrix: F64) -> F64:
+    """Return matrix [M, K] times each of ``vectors`` [N, K], summed in order."""
+    total = vectors[:, :1] * matrix[:, 0]
+    for k in range(1, matrix.shape[1]):
+        total = total + vectors[:, k : k + 1] * matrix[:, k]
+    return np.asarray(total)
+
+
+def _quadrature() -> tuple[F64, F64]:
+    """Return 32 directions [32, 3] and their weights, exact for polynomials up to degree 7: Gauss's
+    four nodes along z, eight angles around it."""
+    root = np.sqrt(1.2) * 2 / 7
+    z = np.sqrt([3 / 7 - root, 3 / 7 + root])
+    weights = np.array([18 + np.sqrt(30.0), 18 - np.sqrt(30.0)]) / 36 * np.pi / 4
+    half = np.sqrt(0.5)
+    around = [(1, 0), (half, half), (0, 1), (-half, half)]
+    circle = np.array([*around, *(tuple(-v for v in each) for each in around)])
+    rows = [
+        (x * np.sqrt(1 - height * height), y * np.sqrt(1 - height * height), height, weight)
+        for node, weight in zip(z, weights, strict=True)
+        for height in (node, -node)
+        for x, y in circle
+    ]
+    table = np.array(rows)
+    return table[:, :3], table[:, 3]
 
 
 def read_field_from_world(path: Path) -> Similarity:

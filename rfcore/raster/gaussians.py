@@ -111,11 +111,11 @@ def with_sky_at(gaussians: Gaussians, distance_m: float) -> Gaussians:
     return replace(gaussians, means=means, log_scales=log_scales)
 
 
-def joined(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Return the Gaussians of ``first``, then those of ``second``, of the same SH degree."""
+def joined(*parts: Gaussians) -> Gaussians:
+    """Return the Gaussians of all parts, one part after the other, of the same SH degree."""
     return Gaussians(
         **{
-            f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
+            f.name: np.concatenate([getattr(part, f.name) for part in parts])
             for f in fields(Gaussians)
         }
     )

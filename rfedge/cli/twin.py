@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rfcore.camera import Vec3
-    from rfcore.field import RadianceField
+    from rfcore.field import RadianceField, SplatField
     from rfedge.twin.scene import TwinScene
     from rfedge.twin.web import Source
 
@@ -51,18 +51,41 @@ class Twin:
     sensorsim: Annotated[str | None, ADDRESS] = None
     """Loopback address at which simulators may ask for pictures: SensorsimService of AlpaSim and
     NuRec (docs/how-to/simulators.md)."""
+    objects: Annotated[tuple[str, ...], arg(name="object", metavar="ID=FIELD ...")] = ()
+    """With --sensorsim: draw the objects of these ids as these fields of splats, each in its
+    object's own axes."""
     ready_file: Annotated[Path | None, arg(metavar="FILE")] = None
     """Write the page's address here once it can be opened."""
 
     def run(self) -> None:
         """Serve the page until SIGINT or SIGTERM."""
+        from rfcore.errors import InvalidInput
         from rfcore.wire.address import Address
         from rfedge.twin.web import TwinRun, WebSettings, run_twin
 
         token = self.token or os.environ.get("RFEDGE_TWIN_TOKEN")
         web = WebSettings(Address.parse("http", self.http), token)
         sensorsim = Address.parse("sensorsim", self.sensorsim) if self.sensorsim else None
-        run_twin(TwinRun(web, self._source(), self.ready_file, self.until_exit_of, sensorsim))
+        if self.objects and sensorsim is None:
+            raise InvalidInput("object", "belongs to --sensorsim HOST:PORT, which is not given")
+        shapes = dict(map(self._shape, self.objects))
+        run_twin(
+            TwinRun(web, self._source(), self.ready_file, self.until_exit_of, sensorsim, shapes)
+        )
+
+    def _shape(self, text: str) -> tuple[str, SplatField]:
+        from rfcore.errors import InvalidInput
+        from rfcore.field import SplatField
+
+        track_id, _, path = text.partition("=")
+        if not (track_id and path):
+            raise InvalidInput("object", f"'{text}' is not ID=FIELD")
+        field = self._open(path)
+        if not isinstance(field, SplatField):
+            raise InvalidInput(
+                "object", f"{path} is a field of kind {field.metadata.kind}; give one of splats"
+            )
+        return track_id, field
 
     def _source(self) -> Callable[[TwinScene], Source]:
         from rfcore.errors import InvalidInput

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +116,20 @@ class LensModel:
             size = f"{k.width_px}x{k.height_px} px"
             raise InvalidInput("resolution", f"{size} are above {MOST_PX} pixels")
 
+    @property
+    def pinhole(self) -> Intrinsics:
+        """The pinhole that is rendered; ``InvalidInput`` for a lens that cannot be."""
+        return self.intrinsics if self.lens is None else _places(self).pinhole
+
+    def pinhole_pixels(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the row and the column in the pinhole of each pixel, broadcastable to [H, W]."""
+        k = self.intrinsics
+        if self.lens is None:
+            return np.arange(k.height_px)[:, None], np.arange(k.width_px)[None]
+        places = _places(self)
+        rows, columns = np.divmod(places.first, places.pinhole.width_px)
+        return rows.reshape(k.height_px, -1), columns.reshape(k.height_px, -1)
+
 
 @dataclass(frozen=True)
 class _Places:
@@ -136,7 +151,45 @@ def render_through(field: RadianceField, model: LensModel, world_from_cam: Pose)
         return rgb_from_colour(field.render_colour(Camera(model.intrinsics, world_from_cam)))
     places = _places(model)
     drawn = rgb_from_colour(field.render_colour(Camera(places.pinhole, world_from_cam)))
-    return _mixed(drawn, places, model.intrinsics)
+    return _mixed(drawn, places, (model.intrinsics.height_px, model.intrinsics.width_px))
+
+
+def render_part(
+    field: RadianceField, model: LensModel, world_from_cam: Pose, part: tuple[slice, slice]
+) -> Rgb:
+    """Return ``part`` (rows, columns) of the picture, rendering little else."""
+    k = model.intrinsics
+    (top, bottom, _), (left, right, _) = part[0].indices(k.height_px), part[1].indices(k.width_px)
+    shape = (bottom - top, right - left)
+    if model.lens is None:
+        own = k.cropped(left, top, shape[1], shape[0])
+        return rgb_from_colour(field.render_colour(Camera(own, world_from_cam)))
+    places = _part_of(_places(model), (k.height_px, k.width_px), part)
+    if places is None:
+        return np.zeros((*shape, 3), np.uint8)
+    drawn = rgb_from_colour(field.render_colour(Camera(places.pinhole, world_from_cam)))
+    return _mixed(drawn, places, shape)
+
+
+def _part_of(places: _Places, shape: tuple[int, int], part: tuple[slice, slice]) -> _Places | None:
+    """Return the places of a part of the picture's ``shape``, in a crop of the pinhole; None if it
+    is all black."""
+
+    def own(values: Any) -> Any:
+        return values.reshape(shape)[part].ravel()
+
+    black = None if places.black is None else own(places.black)
+    rows, columns = np.divmod(own(places.first), places.pinhole.width_px)
+    shown = slice(None) if black is None else ~black
+    if not rows[shown].size:
+        return None
+    top, left = int(rows[shown].min()), int(columns[shown].min())
+    height, width = int(rows[shown].max()) - top + 2, int(columns[shown].max()) - left + 2
+    first = (rows - top) * width + columns - left
+    if black is not None:
+        first[black] = 0
+    pinhole = places.pinhole.cropped(left, top, width, height)
+    return _Places(pinhole, first, own(places.right), own(places.down), black)
 
 
 @lru_cache(maxsize=CACHED_MAPS)
@@ -187,8 +240,9 @@ def _placed(xy: F64, sharp: tuple[float, float], black: NDArray[np.bool_] | None
     return _Places(pinhole, first, share[:, 0].copy(), share[:, 1].copy(), black)
 
 
-def _mixed(drawn: Rgb, places: _Places, k: Intrinsics) -> Rgb:
-    """Return the pixels at the places; two colours at once, in halves of 32 bits."""
+def _mixed(drawn: Rgb, places: _Places, shape: tuple[int, int]) -> Rgb:
+    """Return the pixels at the places, of a picture of ``shape`` (rows, columns); two colours at
+    once, in halves of 32 bits."""
     height, width = drawn.shape[:2]
     packed = np.zeros((height, width, 4), np.uint8)
     packed[..., :3] = drawn
@@ -202,7 +256,7 @@ def _mixed(drawn: Rgb, places: _Places, k: Intrinsics) -> Rgb:
     mixed = np.ascontiguousarray(halves[0] | halves[1], "<u4")
     if places.black is not None:
         mixed[places.black] = 0
-    pixels = mixed.view(np.uint8).reshape(k.height_px, k.width_px, 4)
+    pixels = mixed.view(np.uint8).reshape(*shape, 4)
     return np.ascontiguousarray(pixels[..., :3])
 
 

@@ -4,16 +4,15 @@ The contract is that of AlpaSim (``proto/rfcore/wire/v1/sensorsim.proto``), unde
 its package has had. A scene is a field of the twin, named as its tile or by its own name or id;
 poses are world_from_camera in the tile's frame, camera axes OpenCV's.
 
-Drawn at the middle of the exposure, also for rolling shutters. Dynamic objects have no shape here:
-they are not drawn, which is said once, and to the client in the answer's trailing metadata. Lidar,
-ego masks, windshields and formats other than PNG and JPEG are refused by name.
+Dynamic objects are drawn where the twin was given fields of them. Others are not, which is said
+once, and to the client in the answer's trailing metadata. Lidar, ego masks, windshields and formats
+other than PNG and JPEG are refused by name.
 """
 
 from __future__ import annotations
 
 import asyncio
-import math
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -24,14 +23,17 @@ import structlog
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.image import jpeg_bytes, png_bytes
-from rfcore.lens import BrownLens
+from rfcore.field import RadianceField, SplatField
+from rfcore.image import Rgb, jpeg_bytes, png_bytes
 from rfcore.views import PosedPicture
 from rfcore.wire.address import Address
 from rfcore.wire.conventions import SERVER_OPTIONS
 from rfcore.wire.v1 import sensorsim_pb2 as wire
-from rfedge.twin.lens_picture import LensModel, RadialLens, render_through
+from rfedge.twin.lens_picture import LensModel, render_through
+from rfedge.twin.placed_objects import PlacedObject, with_objects
 from rfedge.twin.scene import PlacedField, TwinScene
+from rfedge.twin.sensorsim_request import SHUTTERS, lens_model, pose_pair
+from rfedge.twin.shutter import Motion, MovingBox, Shutter, lines_motion_px, render_rolling
 
 log = structlog.get_logger()
 
@@ -40,7 +42,6 @@ API_VERSION = (0, 54, 0)
 """Of the contract that was read."""
 MOST_WAITING = 16
 """Calls at once, and pictures of a call; more are refused."""
-NORM_TOLERANCE = 1e-3
 PNG_LEVEL = 1
 """Of zlib: 6, the default, takes five times as long for 12 % fewer bytes."""
 NOT_DRAWN = "rfedge-not-drawn"
@@ -60,27 +61,55 @@ class Refused(RfedgeError):
 class RenderJob:
     """What a request asks for, checked."""
 
-    placed: PlacedField
+    field: RadianceField
     model: LensModel
-    world_from_cam: Pose
+    world_from_cam: Motion
+    shutter: Shutter | None
+    """None: all of the picture is seen at the middle of the exposure."""
     is_jpeg: bool
     quality: float
-    objects: int
-    rolling: bool
+    objects: tuple[tuple[SplatField, Motion], ...] = ()
+    """In a field of splats: shapes, and world_from_object."""
 
     def run(self) -> bytes:
         """Render and encode."""
-        rgb = render_through(self.placed.field, self.model, self.world_from_cam)
+        rgb = self.picture()
         return (
             jpeg_bytes(rgb, quantiser(self.quality)) if self.is_jpeg else png_bytes(rgb, PNG_LEVEL)
         )
 
+    def picture(self) -> Rgb:
+        """Render, uint8 [H, W, 3]."""
+        if self.shutter is None:
+            return render_through(self._field_at(0.5), self.model, self.world_from_cam.middle)
+        boxes = [MovingBox(shape.bounds, motion) for shape, motion in self.objects]
+        motion_px = lines_motion_px(
+            self.field, self.model, self.world_from_cam, self.shutter, boxes
+        )
+        field_at = self._field_at
+        if not any(motion.moves for _, motion in self.objects):
+            still = self._field_at(0.5)
+            field_at = lambda _: still  # noqa: E731
+        return render_rolling(field_at, self.model, self.world_from_cam, self.shutter, motion_px)
+
+    def _field_at(self, share: float) -> RadianceField:
+        if not isinstance(self.field, SplatField):
+            return self.field
+        return with_objects(
+            self.field, [PlacedObject(shape, motion.at(share)) for shape, motion in self.objects]
+        )
+
 
 class Sensorsim:
-    """Answers simulators from the fields of ``scene``; ``drive`` offers its cameras and poses."""
+    """Answers simulators from the fields of ``scene``; ``drive`` offers its cameras and poses,
+    ``shapes`` are the fields of dynamic objects by their ids."""
 
     def __init__(
-        self, address: Address, scene: TwinScene, drive: Sequence[PosedPicture] = ()
+        self,
+        address: Address,
+        scene: TwinScene,
+        drive: Sequence[PosedPicture] = (),
+        shapes: Mapping[str, SplatField] | None = None,
     ) -> None:
         if not address.is_loopback:
             raise InvalidInput(
@@ -91,6 +120,7 @@ class Sensorsim:
         self._address = address
         self._scene = scene
         self._drive = drive
+        self._shapes = dict(shapes or {})
         self._executor = ThreadPoolExecutor(1, "sensorsim")
         self._server: grpc.aio.Server | None = None
         self._said: set[str] = set()
@@ -130,7 +160,7 @@ class Sensorsim:
 
     async def _render_rgb(self, request: wire.RGBRenderRequest, call: Any) -> wire.RGBRenderReturn:
         job = self._job(request)
-        self._say(job, call)
+        self._say(job, len(request.dynamic_objects) - len(job.objects), call)
         loop = asyncio.get_running_loop()
         return wire.RGBRenderReturn(image_bytes=await loop.run_in_executor(self._executor, job.run))
 
@@ -247,10 +277,9 @@ class Sensorsim:
             raise Refused(
                 INVALID, f"image_format: {request.image_format}; 1 (PNG) and 2 (JPEG) are"
             )
-        pair = request.sensor_pose
-        start, end = _pose("start_pose", pair.start_pose), _pose("end_pose", pair.end_pose)
+        world_from_cam = pose_pair("sensor_pose", request.sensor_pose)
         start_us, end_us = request.frame_start_us, request.frame_end_us
-        if end_us < start_us or (end_us == start_us and start != end):
+        if end_us < start_us or (end_us == start_us and world_from_cam.moves):
             raise InvalidInput(
                 "frame_end_us",
                 f"{end_us} is not after frame_start_us {start_us}; two poses need an exposure",
@@ -263,15 +292,30 @@ class Sensorsim:
         size_px = (request.resolution_w, request.resolution_h)
         if size_px == (0, 0):
             size_px = (spec.resolution_w, spec.resolution_h)
-        rolling = start != end and spec.shutter_type != wire.SHUTTER_TYPE_GLOBAL
+        if spec.shutter_type not in SHUTTERS:
+            raise InvalidInput("shutter_type", f"{spec.shutter_type} is outside 0..5")
+        objects = self._objects(placed.field, request.dynamic_objects)
+        moves = world_from_cam.moves or any(motion.moves for _, motion in objects)
         return RenderJob(
-            placed,
+            placed.field,
             self._model(spec, size_px),
-            middle(start, end),
+            world_from_cam,
+            SHUTTERS[spec.shutter_type] if moves else None,
             is_jpeg,
             quality or 95.0,
-            len(request.dynamic_objects),
-            rolling,
+            objects,
+        )
+
+    def _objects(
+        self, field: RadianceField, asked: Iterable[wire.DynamicObject]
+    ) -> tuple[tuple[SplatField, Motion], ...]:
+        """Return the objects that can be drawn."""
+        if not isinstance(field, SplatField):
+            return ()
+        return tuple(
+            (self._shapes[each.track_id], pose_pair(f"'{each.track_id}'.pose_pair", each.pose_pair))
+            for each in asked
+            if each.track_id in self._shapes
         )
 
     def _model(self, spec: wire.CameraSpec, size_px: tuple[int, int]) -> LensModel:
@@ -289,13 +333,20 @@ class Sensorsim:
             return LensModel(offered[spec.logical_id].resized(*size_px))
         return lens_model(spec, size_px)
 
-    def _say(self, job: RenderJob, call: Any) -> None:
+    def _say(self, job: RenderJob, missing: int, call: Any) -> None:
         """Say what the picture lacks: once in the log, in each answer."""
-        if job.objects:
-            call.set_trailing_metadata(((NOT_DRAWN, f"{job.objects} dynamic objects"),))
-            self._once("dynamic objects are not drawn: a field has no shapes for them")
-        if job.rolling:
-            self._once("rolling shutters are drawn as one instant, the middle of the exposure")
+        if missing:
+            call.set_trailing_metadata(((NOT_DRAWN, f"{missing} dynamic objects"),))
+            self._once(
+                "dynamic objects without a shape are not drawn (--object ID=FIELD)"
+                if isinstance(job.field, SplatField)
+                else f"dynamic objects are not drawn in a field of kind {job.field.metadata.kind}"
+            )
+        if any(s.metadata.antialiased != job.field.metadata.antialiased for s, _ in job.objects):
+            self._once(
+                "objects and field were not both trained with --antialiased, or both without: "
+                "objects look too thin or too thick from afar"
+            )
 
     def _once(self, text: str) -> None:
         if text not in self._said:
@@ -333,95 +384,6 @@ def quantiser(quality: float) -> int:
     return round(min(31.0, max(1.0, (100.0 - quality) / 5.0)))
 
 
-def middle(first: Pose, second: Pose) -> Pose:
-    """Return the pose half way, with the same bits on every machine."""
-    a, b = first.rotation, second.rotation
-    sign = 1.0 if sum(p * q for p, q in zip(a, b, strict=True)) >= 0 else -1.0
-    total = [p + sign * q for p, q in zip(a, b, strict=True)]
-    norm = math.sqrt(sum(value * value for value in total))
-    w, x, y, z = (value / norm for value in total)
-    x_m, y_m, z_m = (
-        0.5 * (p + q) for p, q in zip(first.translation_m, second.translation_m, strict=True)
-    )
-    return Pose((x_m, y_m, z_m), (w, x, y, z))
-
-
-def _pose(name: str, pose: wire.SensorPose) -> Pose:
-    q, v = pose.quat, pose.vec
-    norm = math.sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z)
-    if not abs(norm - 1) <= NORM_TOLERANCE:  # NaN as well
-        raise InvalidInput(
-            f"sensor_pose.{name}.quat",
-            f"({q.w:g}, {q.x:g}, {q.y:g}, {q.z:g}) is of length {norm:g}, not 1",
-        )
-    return Pose((v.x, v.y, v.z), (q.w / norm, q.x / norm, q.y / norm, q.z / norm))
-
-
 def _to_wire(pose: Pose) -> wire.SensorPose:
     (x, y, z), (w, a, b, c) = pose.translation_m, pose.rotation
     return wire.SensorPose(vec=wire.Vec3(x=x, y=y, z=z), quat=wire.Quat(w=w, x=a, y=b, z=c))
-
-
-def lens_model(spec: wire.CameraSpec, size_px: tuple[int, int]) -> LensModel:
-    """Return the lens of a request, for pictures of (width, height); its own resolution is another
-    one if it states that.
-
-    Raises ``InvalidInput`` for what is not rendered.
-    """
-    own_px = (spec.resolution_w or size_px[0], spec.resolution_h or size_px[1])
-    kind = spec.WhichOneof("camera_param")
-    if kind == "opencv_pinhole_param":
-        return _pinhole(spec.opencv_pinhole_param, own_px, size_px)
-    if kind == "opencv_fisheye_param":
-        return _fisheye(spec.opencv_fisheye_param, own_px, size_px)
-    return _ftheta(spec.ftheta_param, own_px, size_px)
-
-
-def _pinhole(
-    p: wire.OpenCVPinholeCameraParam, own_px: tuple[int, int], size_px: tuple[int, int]
-) -> LensModel:
-    radial, tangential = [*p.radial_coeffs, *[0.0] * 6][:6], [*p.tangential_coeffs, 0.0, 0.0][:2]
-    others = {"k4": radial[3], "k5": radial[4], "k6": radial[5]} | {
-        f"s{i + 1}": value for i, value in enumerate(p.thin_prism_coeffs)
-    }
-    wrong = [f"{name} = {value:g}" for name, value in others.items() if value != 0]
-    if wrong:
-        raise InvalidInput(
-            "opencv_pinhole_param", f"{', '.join(wrong)}; k1, k2, k3, p1 and p2 are rendered"
-        )
-    k = Intrinsics(
-        *own_px, p.focal_length_x, p.focal_length_y, p.principal_point_x, p.principal_point_y
-    ).resized(*size_px)
-    coefficients = (radial[0], radial[1], *tangential, radial[2])
-    return LensModel(k, BrownLens(*coefficients) if any(coefficients) else None)
-
-
-def _fisheye(
-    p: wire.OpenCVFisheyeCameraParam, own_px: tuple[int, int], size_px: tuple[int, int]
-) -> LensModel:
-    k1, k2, k3, k4 = [*p.radial_coeffs, *[0.0] * 4][:4]
-    k = Intrinsics(
-        *own_px, p.focal_length_x, p.focal_length_y, p.principal_point_x, p.principal_point_y
-    ).resized(*size_px)
-    series = (0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4)
-    return LensModel(k, RadialLens(series, max_angle_rad=p.max_angle))
-
-
-def _ftheta(
-    p: wire.FthetaCameraParam, own_px: tuple[int, int], size_px: tuple[int, int]
-) -> LensModel:
-    backward = p.reference_poly == wire.POLYNOMIAL_TYPE_PIXELDIST_TO_ANGLE
-    forward = p.reference_poly == wire.POLYNOMIAL_TYPE_ANGLE_TO_PIXELDIST
-    if not (backward or forward):
-        raise InvalidInput("ftheta_param.reference_poly", f"{p.reference_poly} is neither 1 nor 2")
-    linear = (1.0, 0.0, 0.0)
-    if p.HasField("linear_cde"):
-        linear = (p.linear_cde.linear_c, p.linear_cde.linear_d, p.linear_cde.linear_e)
-    lens = RadialLens(
-        () if backward else tuple(p.angle_to_pixeldist_poly),
-        tuple(p.pixeldist_to_angle_poly) if backward else (),
-        linear,
-        p.max_angle,
-    )
-    centre = (p.principal_point_x + 0.5, p.principal_point_y + 0.5)
-    return LensModel(Intrinsics(*own_px, 1.0, 1.0, *centre).resized(*size_px), lens)

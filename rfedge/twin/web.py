@@ -13,9 +13,9 @@ import json
 import os
 import signal
 import time
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -24,6 +24,7 @@ import structlog
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
+from rfcore.field import SplatField
 from rfcore.files import write_whole
 from rfcore.perception.objects import CameraKey
 from rfcore.wire.address import Address
@@ -381,6 +382,8 @@ class TwinRun:
     """A process at whose end this one ends, too."""
     sensorsim: Address | None = None
     """Where simulators ask for pictures."""
+    shapes: Mapping[str, SplatField] = field(default_factory=dict)
+    """The fields of a simulator's objects, by their ids."""
 
 
 def run_twin(run: TwinRun) -> None:
@@ -427,7 +430,7 @@ async def _for_simulators(run: TwinRun, scene: TwinScene, source: Source) -> Sen
     if run.sensorsim is None:
         return None
     drive = source.pictures if isinstance(source, DriveSource) else ()
-    service = Sensorsim(run.sensorsim, scene, drive)
+    service = Sensorsim(run.sensorsim, scene, drive, run.shapes)
     print(f"simulators: {await service.start()}", flush=True)
     return service
 

@@ -13,13 +13,15 @@ from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
+import cv2
 import grpc
 import numpy as np
 import pytest
+import tyro
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.dataset.undistort import pinhole_of, undistorted
-from rfcore.errors import InvalidInput
+from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import FieldMetadata, SplatField, save_field
 from rfcore.image import rgb_from_bytes, rgb_from_colour
 from rfcore.lens import BrownLens, FisheyeLens
@@ -28,9 +30,12 @@ from rfcore.native.backend import available_isas
 from rfcore.views import PosedPicture
 from rfcore.wire.address import Address
 from rfcore.wire.v1 import sensorsim_pb2 as ours
+from rfedge.cli.twin import Twin
 from rfedge.twin.lens_picture import LensModel, RadialLens, render_through
+from rfedge.twin.placed_objects import PlacedObject, with_objects
 from rfedge.twin.scene import Board, PlacedField, TwinScene
-from rfedge.twin.sensorsim import NOT_DRAWN, SERVICES, Sensorsim, middle
+from rfedge.twin.sensorsim import NOT_DRAWN, SERVICES, Sensorsim
+from rfedge.twin.shutter import Motion, Shutter, lines_motion_px, render_rolling
 
 sim = import_module("carla_driver_interface._proto.sensorsim_pb2")
 common = import_module("carla_driver_interface._proto.common_pb2")
@@ -46,11 +51,24 @@ def wall(wall: SplatField) -> SplatField:
     return SplatField(replace(wall.gaussians, sh=colour[:, None]))
 
 
+@pytest.fixture(scope="module")
+def car(wall: SplatField) -> SplatField:
+    """A bright plate of 0.4 m x 0.3 m, in its own axes."""
+    means = wall.gaussians.means
+    near = (np.abs(means[:, 0]) < 0.2) & (np.abs(means[:, 1]) < 0.15)
+    part = {name: np.ascontiguousarray(value[near]) for name, value in vars(wall.gaussians).items()}
+    part["means"][:, 2] = 0
+    part["sh"][:] = 1.7
+    return SplatField(replace(wall.gaussians, **part))
+
+
 @asynccontextmanager
-async def serving(field: SplatField, drive: Any = ()) -> AsyncIterator["Client"]:
+async def serving(
+    field: SplatField, drive: Any = (), shapes: Any = None
+) -> AsyncIterator["Client"]:
     scene = TwinScene(Board())
     scene.place(PlacedField(field, "field", b""), 0.0)
-    service = Sensorsim(Address("127.0.0.1", 0), scene, drive)
+    service = Sensorsim(Address("127.0.0.1", 0), scene, drive, shapes)
     address = await service.start()
     try:
         async with grpc.aio.insecure_channel(str(address)) as channel:
@@ -100,7 +118,10 @@ def pinhole(**other: Any) -> Any:
 
 def request(start: Pose = EYE, end: Pose | None = None, **other: Any) -> Any:
     spec = sim.CameraSpec(
-        resolution_w=64, resolution_h=48, opencv_pinhole_param=pinhole(), shutter_type=1
+        resolution_w=64,
+        resolution_h=48,
+        opencv_pinhole_param=pinhole(),
+        shutter_type=other.pop("shutter_type", 1),
     )
     fields = {
         "scene_id": "field",
@@ -179,13 +200,15 @@ async def test_every_method_of_the_contract_is_served_under_both_names(wall, ser
         assert list(scenes.scene_ids) == ["field"]
 
 
-async def test_a_picture_is_the_fields_render_at_the_middle_of_the_exposure(wall):
-    end = Pose((0.3, 0.0, 0.1), (math.cos(0.1), 0.0, -math.sin(0.1), 0.0))
-    k = Intrinsics(64, 48, 40.0, 42.0, 32.0, 24.0)
+K = Intrinsics(64, 48, 40.0, 42.0, 32.0, 24.0)
+END = Pose((0.3, 0.0, 0.1), (math.cos(0.1), 0.0, -math.sin(0.1), 0.0))
+
+
+async def test_a_picture_of_a_global_shutter_is_the_fields_render_at_the_middle(wall):
     async with serving(wall) as client:
-        for start, stop in ((EYE, EYE), (EYE, end)):
-            camera = Camera(k, middle(float32(start), float32(stop)))
-            shown = await client.picture(request(start, stop))
+        for start, stop, shutter in ((EYE, EYE, 1), (EYE, EYE, 5), (EYE, END, 5), (EYE, END, 0)):
+            camera = Camera(K, Motion(float32(start), float32(stop)).middle)
+            shown = await client.picture(request(start, stop, shutter_type=shutter))
             np.testing.assert_array_equal(shown, rgb_from_colour(wall.render_colour(camera)))
         jpeg = await client.picture(request(image_format=2))
         assert psnr(jpeg, await client.picture(request())) > 35
@@ -193,11 +216,37 @@ async def test_a_picture_is_the_fields_render_at_the_middle_of_the_exposure(wall
         assert smaller.shape == (24, 32, 3)
 
 
-def test_the_middle_of_two_poses_is_half_way():
-    turned = Pose((2.0, 0.0, 4.0), (-math.cos(0.2), 0.0, 0.0, -math.sin(0.2)))
-    half = middle(Pose.identity(), turned)
-    assert half.translation_m == (1.0, 0.0, 2.0)
-    assert half.rotation == pytest.approx((math.cos(0.1), 0.0, 0.0, math.sin(0.1)))
+async def test_rolling_shutters_read_the_lines_in_the_order_of_their_names(wall):
+    motion, model = Motion(float32(EYE), float32(END)), LensModel(K)
+    start, end = (
+        render_through(wall, model, pose).astype(int) for pose in (motion.start, motion.end)
+    )
+    first_and_last = {
+        "ROLLING_TOP_TO_BOTTOM": (np.s_[0], np.s_[-1]),
+        "ROLLING_LEFT_TO_RIGHT": (np.s_[:, 0], np.s_[:, -1]),
+        "ROLLING_BOTTOM_TO_TOP": (np.s_[-1], np.s_[0]),
+        "ROLLING_RIGHT_TO_LEFT": (np.s_[:, -1], np.s_[:, 0]),
+    }
+    async with serving(wall) as client:
+        for name, (first, last) in first_and_last.items():
+            (number,) = (
+                v.number
+                for v in sim.DESCRIPTOR.enum_types_by_name["ShutterType"].values
+                if v.name.endswith(name)
+            )
+            shown = (await client.picture(request(EYE, END, shutter_type=number))).astype(int)
+            for line, there, elsewhere in ((first, start, end), (last, end, start)):
+                near, far = (np.abs(shown[line] - each[line]).mean() for each in (there, elsewhere))
+                assert 4 * near < far, name
+
+
+async def test_a_rolling_picture_is_that_of_its_shutter(wall):
+    motion, model, shutter = Motion(float32(EYE), float32(END)), LensModel(K), Shutter(reverse=True)
+    moves = lines_motion_px(wall, model, motion, shutter)
+    want = render_rolling(lambda _: wall, model, motion, shutter, moves)
+    async with serving(wall) as client:
+        shown = await client.picture(request(EYE, END, shutter_type=3))
+    np.testing.assert_array_equal(shown, want)
 
 
 def sensor_points() -> np.ndarray:
@@ -229,7 +278,42 @@ def test_the_linear_term_is_taken_off_and_what_no_direction_reaches_is_infinite(
     assert angle[1] == math.inf
 
 
-@pytest.mark.parametrize("lens", [BrownLens(-0.1, 0.02, 0.002, -0.001), FisheyeLens(0.01, -0.002)])
+async def test_the_rational_lens_with_thin_prisms_is_opencvs(wall):
+    """A spot on the wall is where cv2.projectPoints puts it, to a quarter of a pixel."""
+    radial, (p1, p2), prism = (
+        [0.4, 0.1, 0.02, 0.6, 0.15, 0.03],
+        (0.01, -0.02),
+        [0.03, 0.01, -0.04, 0],
+    )
+    opencv = np.array([*radial[:2], p1, p2, *radial[2:], *prism])
+    matrix = np.array([[40.0, 0, 32], [0, 42, 24], [0, 0, 1]])
+    means = wall.gaussians.means
+    lens = pinhole(radial_coeffs=radial, tangential_coeffs=[p1, p2], thin_prism_coeffs=prism)
+    still = pose_of(Pose.identity())
+    message = with_camera(opencv_pinhole_param=lens)
+    message.sensor_pose.CopyFrom(sim.PosePair(start_pose=still, end_pose=still))
+    for at in ((-1.4, -1.0), (1.4, 0.9), (1.6, -1.1)):
+        spot = np.hypot(means[:, 0] - at[0], means[:, 1] - at[1]) < 0.08
+        sh = np.where(spot, 1.7, -1.9).astype(np.float32)[:, None, None].repeat(3, 2)
+        centre = means[spot].mean(axis=0).astype(float)
+        projected, _ = cv2.projectPoints(centre[None], np.zeros(3), np.zeros(3), matrix, opencv)
+        async with serving(SplatField(replace(wall.gaussians, sh=sh))) as client:
+            level = (await client.picture(message))[..., 0].astype(float)
+        v, u = np.mgrid[:48, :64] + 0.5
+        found = np.array([(level * u).sum(), (level * v).sum()]) / level.sum()
+        straight = matrix[:2, 2] + matrix.diagonal()[:2] * centre[:2] / centre[2]
+        assert np.hypot(*(found - projected[0, 0])) < 0.25
+        assert np.hypot(*(straight - projected[0, 0])) > 0.5
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        BrownLens(-0.1, 0.02, 0.002, -0.001),
+        BrownLens(0.4, 0.1, 0.001, -0.002, 0.02, 0.6, 0.15, 0.03, 0.003, 0.001, -0.004),
+        FisheyeLens(0.01, -0.002),
+    ],
+)
 def test_a_picture_through_a_lens_undistorts_to_the_pinholes(wall, lens):
     k = Intrinsics(160, 120, 90.0, 92.0, 80.5, 59.0)
     model = lens
@@ -311,15 +395,16 @@ def posed(**quat: float) -> Any:
         (request(image_format=2, image_quality=101), "INVALID_ARGUMENT", "101 is outside 0..100"),
         (request(insert_ego_mask=True), "INVALID_ARGUMENT", "there are no ego masks"),
         (with_camera(logical_id="rear"), "NOT_FOUND", "logical_id 'rear' is no camera here"),
+        (request(shutter_type=9), "INVALID_ARGUMENT", r"shutter_type: 9 is outside 0\.\.5"),
         (
-            with_camera(opencv_pinhole_param=pinhole(radial_coeffs=[0, 0, 0, 0.5, 0, 0])),
+            with_camera(opencv_pinhole_param=pinhole(radial_coeffs=[0, 0, 0, 9, 0, 0])),
             "INVALID_ARGUMENT",
-            "k4 = 0.5; k1, k2, k3, p1 and p2 are rendered",
+            "no direction reaches|not one-to-one",
         ),
         (
-            with_camera(opencv_pinhole_param=pinhole(thin_prism_coeffs=[0, 0.1, 0, 0])),
+            with_camera(opencv_pinhole_param=pinhole(thin_prism_coeffs=[0, NAN, 0, 0])),
             "INVALID_ARGUMENT",
-            "s2 = 0.1",
+            "s2=nan.* not finite",
         ),
         (
             with_camera(opencv_pinhole_param=sim.OpenCVPinholeCameraParam()),
@@ -393,14 +478,49 @@ async def test_a_batch_says_which_picture_failed(wall):
     assert [one.image_bytes for one in made] == [alone.image_bytes] * 2
 
 
-async def test_what_is_not_drawn_is_said_with_the_picture(wall):
-    async with serving(wall) as client:
-        pair = sim.PosePair(start_pose=pose_of(EYE), end_pose=pose_of(EYE))
-        objects = [sim.DynamicObject(track_id="car", pose_pair=pair)] * 2
+def an_object(track_id: str, start: Pose, end: Pose | None = None) -> Any:
+    pair = sim.PosePair(start_pose=pose_of(start), end_pose=pose_of(end or start))
+    return sim.DynamicObject(track_id=track_id, pose_pair=pair)
+
+
+async def test_objects_with_a_shape_are_drawn_and_the_others_counted(wall, car):
+    there = Pose((0.2, 0.0, 2.0), (math.cos(0.4), 0.0, math.sin(0.4), 0.0))
+    objects = [an_object("car", there), an_object("dog", there), an_object("cat", there)]
+    async with serving(wall, shapes={"car": car}) as client:
         call = client.call("render_rgb", request(dynamic_objects=objects))
-        await call
+        shown = rgb_from_bytes((await call).image_bytes, "answer")
         said = dict(iter(await call.trailing_metadata()))
+        bare = client.call("render_rgb", request(dynamic_objects=objects[:1]))
+        np.testing.assert_array_equal(rgb_from_bytes((await bare).image_bytes, "answer"), shown)
+        assert NOT_DRAWN not in dict(iter(await bare.trailing_metadata()))
     assert said[NOT_DRAWN] == "2 dynamic objects"
+    placed = with_objects(wall, [PlacedObject(car, Motion(*[float32(there)] * 2).at(0.5))])
+    camera = Camera(K, Motion(float32(EYE), float32(EYE)).middle)
+    np.testing.assert_array_equal(shown, rgb_from_colour(placed.render_colour(camera)))
+    assert psnr(shown, rgb_from_colour(wall.render_colour(camera))) < 30
+
+
+async def test_an_object_that_moves_is_in_the_middle_or_leans(wall, car):
+    """By a shutter that is global, or rolling with the camera still."""
+    left, right = (Pose((x, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0)) for x in (-0.5, 0.5))
+    objects = [an_object("car", left, right)]
+    camera = Camera(K, Motion(float32(EYE), float32(EYE)).middle)
+    placed = with_objects(wall, [PlacedObject(car, Motion(left, right).middle)])
+    middle = rgb_from_colour(placed.render_colour(camera))
+    async with serving(wall, shapes={"car": car}) as client:
+        shown = await client.picture(request(dynamic_objects=objects, shutter_type=5))
+        np.testing.assert_array_equal(shown, middle)
+        leaning = await client.picture(request(dynamic_objects=objects))
+    differs = np.flatnonzero((leaning.astype(int) - middle).__abs__().max(axis=(1, 2)) > 9)
+    assert len(differs) > 5
+    assert differs.max() - differs.min() < 20, "only the object's rows"
+
+
+async def test_an_object_without_a_pose_is_refused_by_its_id(wall, car):
+    lost = request(dynamic_objects=[sim.DynamicObject(track_id="car")])
+    async with serving(wall, shapes={"car": car}) as client:
+        with pytest.raises(grpc.aio.AioRpcError, match=r"'car'\.pose_pair\.start_pose\.quat"):
+            await client.picture(lost)
 
 
 async def test_a_drive_offers_its_cameras_and_poses(wall):
@@ -437,9 +557,12 @@ async def test_a_scene_goes_by_its_fields_name_and_none_is_there_before_it_is_lo
     assert refused.value.code() is grpc.StatusCode.UNAVAILABLE
 
 
-async def test_the_command_serves_simulators_beside_the_page(wall, tmp_path):
+async def test_the_command_serves_simulators_beside_the_page(wall, car, tmp_path):
     save_field(wall, tmp_path / "painted.rff")
+    save_field(car, tmp_path / "car.rff")
     words = ["--http", "127.0.0.1:0", "--sensorsim", "127.0.0.1:0"]
+    words += ["--object", f"7={tmp_path / 'car.rff'}"]
+    there = Pose((0.0, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0))
     command = [sys.executable, "-m", "rfedge", "twin", str(tmp_path / "painted.rff"), *words]
     process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
     try:
@@ -450,10 +573,10 @@ async def test_the_command_serves_simulators_beside_the_page(wall, tmp_path):
             async with asyncio.timeout(60):
                 while not (await client.call("get_available_scenes", common.Empty())).scene_ids:
                     pass  # the field is being read
-            shown = await client.picture(request())
-        k = Intrinsics(64, 48, 40.0, 42.0, 32.0, 24.0)
-        camera = Camera(k, middle(float32(EYE), float32(EYE)))
-        np.testing.assert_array_equal(shown, rgb_from_colour(wall.render_colour(camera)))
+            shown = await client.picture(request(dynamic_objects=[an_object("7", there)]))
+        camera = Camera(K, Motion(float32(EYE), float32(EYE)).middle)
+        street = with_objects(wall, [PlacedObject(car, there)])
+        np.testing.assert_array_equal(shown, rgb_from_colour(street.render_colour(camera)))
     finally:
         process.terminate()
         assert await process.wait() == 0
@@ -462,3 +585,16 @@ async def test_the_command_serves_simulators_beside_the_page(wall, tmp_path):
 def test_the_port_is_this_machines_alone():
     with pytest.raises(InvalidInput, match=r"0\.0\.0\.0:1 can be reached .*\(ssh -L\)"):
         Sensorsim(Address("0.0.0.0", 1), TwinScene(Board()))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--object", "car=car.rff"], "object: belongs to --sensorsim HOST:PORT"),
+        (["--sensorsim", "127.0.0.1:0", "--object", "car.rff"], "object: 'car.rff' is not ID="),
+        (["--sensorsim", "127.0.0.1:0", "--object", "car=missing.rff"], "missing.rff"),
+    ],
+)
+def test_an_object_that_is_none_is_refused(words, said):
+    with pytest.raises(RfedgeError, match=said):
+        tyro.cli(Twin, args=["street", "--http", "127.0.0.1:0", *words]).run()
