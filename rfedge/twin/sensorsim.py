@@ -86,11 +86,15 @@ class RenderJob:
         motion_px = lines_motion_px(
             self.field, self.model, self.world_from_cam, self.shutter, boxes
         )
-        field_at = self._field_at
-        if not any(motion.moves for _, motion in self.objects):
-            still = self._field_at(0.5)
-            field_at = lambda _: still  # noqa: E731
-        return render_rolling(field_at, self.model, self.world_from_cam, self.shutter, motion_px)
+        moving = any(motion.moves for _, motion in self.objects)
+        still = None if moving else self._field_at(0.5)
+        return render_rolling(
+            lambda share: self._field_at(share) if still is None else still,
+            self.model,
+            self.world_from_cam,
+            self.shutter,
+            motion_px,
+        )
 
     def _field_at(self, share: float) -> RadianceField:
         if not isinstance(self.field, SplatField):

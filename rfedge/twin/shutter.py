@@ -175,7 +175,7 @@ def _scene_motion(field: RadianceField, k: Intrinsics, world_from_cam: Motion) -
         du, dv = k.fx_px * (there[0] / z - x), k.fy_px * (there[1] / z - y)
         way = np.where(ahead, np.sqrt(du * du + dv * dv), k.width_px + k.height_px)
         farthest = np.maximum(farthest, way)
-    return 2 * farthest
+    return np.asarray(2 * farthest)
 
 
 def _add_box(moves: F64, k: Intrinsics, world_from_cam: Motion, box: MovingBox) -> None:
