@@ -69,7 +69,7 @@ def load_json(file: Path) -> Any:
 def load_toml(file: Path) -> dict[str, Any]:
     """Return the content of a TOML file; raise ``DatasetError`` naming it."""
     try:
-        return tomllib.loads(read_file(file, MAX_TEXT_BYTES).decode())
+        return tomllib.loads(read_file(file, MAX_TEXT_BYTES).decode("utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DatasetError(f"{file}: not TOML ({error})") from error
 
@@ -123,7 +123,7 @@ def finite_numbers(where: str, words: Sequence[str]) -> list[float]:
 def text_lines(file: Path) -> list[str]:
     """Return a text file's lines; raise ``DatasetError`` for bytes that are no UTF-8."""
     try:
-        return read_file(file).decode().splitlines()
+        return read_file(file).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise DatasetError(f"{file}: not a text file ({error.reason})") from error
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path, PurePosixPath
+from posixpath import normpath
 from typing import Any
 
 import numpy as np
@@ -65,8 +66,12 @@ def _inside(where: str, folder: Path, name: str) -> Path | None:
     path = PurePosixPath(name.replace("\\", "/"))
     if any(len(part.encode()) > MAX_PART_BYTES for part in path.parts):
         raise DatasetError(f"{where}: path {shortened(name)} is too long")
+    path = PurePosixPath(normpath(path))
     if ".." in path.parts or "\0" in name:
-        raise DatasetError(f"{where}: path '{name}' leaves the dataset's folder {folder}")
+        raise DatasetError(
+            f"{where}: path '{name}' leaves the dataset's folder {folder}; put the file that names "
+            "it into a folder above all pictures"
+        )
     if not is_absolute(name):
         return folder / path
     ends = (folder.joinpath(*path.parts[i:]) for i in range(1, len(path.parts)))

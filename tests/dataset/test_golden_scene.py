@@ -35,6 +35,18 @@ def test_the_pixel_of_the_point_is_white(golden, format_name, tmp_path):
         assert np.median(rgb) == pytest.approx(90, abs=1)
 
 
+def test_a_byte_order_mark_before_text_changes_nothing(golden, format_name, tmp_path):
+    """Editors of Windows write one."""
+    folder = golden.write(format_name, tmp_path / "d")
+    plain = read_dataset(folder)
+    root = folder if folder.is_dir() else folder.parent
+    texts = [p for p in root.rglob("*") if p.suffix in (".txt", ".json", ".toml", ".csv")]
+    for text in texts:
+        text.write_bytes(b"\xef\xbb\xbf" + text.read_bytes())
+    assert texts or format_name == "colmap_binary"
+    assert [p.camera for p in read_dataset(folder).pictures] == [p.camera for p in plain.pictures]
+
+
 def test_a_scene_at_utm_magnitudes_keeps_its_pixels(golden_utm, format_name, tmp_path):
     """float64 resolves 1e-9 m there; cam_from_world of COLMAP multiplies that by its turn."""
     dataset = read_dataset(golden_utm.write(format_name, tmp_path / "d"))

@@ -71,6 +71,15 @@ def test_no_name_leaves_the_folder(name, tmp_path):
         inside("x", tmp_path, name)
 
 
+def test_a_name_may_go_out_of_a_folder_and_back_in(tmp_path):
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), RGB)
+    name = "./images/../images/a.png"
+    assert find_picture("x", tmp_path, name) == tmp_path / "images" / "a.png"
+    with pytest.raises(DatasetError, match="into a folder above all pictures"):
+        find_picture("x", tmp_path / "images", "../images/a.png")
+
+
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp"])
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.97])
 def test_a_truncated_picture_is_refused(name, share, tmp_path):
