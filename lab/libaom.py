@@ -12,20 +12,19 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from io import BytesIO
 from time import process_time_ns
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import av
 import imageio_ffmpeg
 
-from rfcore.codec.h264.ffmpeg import picture_of
 from rfcore.errors import CodecError
 from rfcore.image import I420
 from rfedge.evaluate.clips import CodedClip
-from rfedge.evaluate.rivals import CodedPictures
+from rfedge.evaluate.rivals import CodedPictures, decoded_pictures
 
 CRFS = (18.0, 24.0, 30.0, 36.0, 42.0, 48.0, 54.0, 60.0)
-IVF_HEADER, IVF_FRAME_HEADER = 32, 12
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,7 @@ class Libaom:
         if len(packets) != len(frames):
             raise CodecError(f"{self.name}: {len(frames)} frames came out as {len(packets)}")
         began_ns = process_time_ns()
-        decoder = cast(av.VideoCodecContext, av.CodecContext.create("libdav1d", "r"))
-        decoder.thread_count = 1
-        shown = [frame for packet in packets for frame in decoder.decode(av.Packet(packet))]
-        decoded = [picture_of(frame) for frame in (*shown, *decoder.decode(None))]
+        decoded = decoded_pictures("libdav1d", packets)
         decoder_ms = (process_time_ns() - began_ns) / 1e6
         sizes = [len(packet) for packet in packets]
         return CodedPictures(sizes, decoded, 1e3 * coded_s, decoder_ms)
@@ -121,10 +117,5 @@ def _children_s() -> float:
 
 def _packets(ivf: bytes) -> list[bytes]:
     """Return the temporal units of an IVF file, one a picture."""
-    packets, at = [], IVF_HEADER
-    while at < len(ivf):
-        size = int.from_bytes(ivf[at : at + 4], "little")
-        at += IVF_FRAME_HEADER
-        packets.append(ivf[at : at + size])
-        at += size
-    return packets
+    with av.open(BytesIO(ivf), "r", format="ivf") as container:
+        return [bytes(packet) for packet in container.demux(video=0) if packet.size]

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from rfcore.camera import Pose
 from rfcore.dataset.bag_transforms import Edge
-from rfcore.dataset.drive_set import Shot, pinhole_of_matrix, posed_source
+from rfcore.dataset.drive_set import US, Shot, pinhole_of_matrix, posed_source
 from rfcore.dataset.keys import filled_lines, finite_numbers, text_lines
 from rfcore.dataset.picture_header import picture_header
 from rfcore.dataset.source import Source
@@ -30,7 +30,6 @@ from rfcore.errors import DatasetError
 POSES = "camera_poses.csv"
 """The file by which a drive is recognised."""
 COLUMNS = ("easting", "northing", "altitude", "roll", "pitch", "heading")
-US = 1000
 
 
 class BoreasDrive:

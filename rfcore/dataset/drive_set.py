@@ -24,6 +24,8 @@ from rfcore.errors import DatasetError, named
 from rfcore.image import Rgb
 from rfcore.views import Mask
 
+US = 1000
+"""Nanoseconds of a microsecond."""
 MAX_GAP_NS = NS
 """Poses further apart are not interpolated."""
 

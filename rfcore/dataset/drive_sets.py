@@ -15,7 +15,7 @@ SETS: dict[str, tuple[str, Callable[[Path], DriveSet]]] = {
     boreas.POSES: (f"applanix/{boreas.POSES}", boreas.BoreasDrive),
     comma2k19.POSITIONS: (f"global_pose/{comma2k19.POSITIONS}", comma2k19.CommaSegment),
 }
-"""By the name of the file that a set is recognised by: where it lies, and what reads it."""
+"""Where the file lies that a set is recognised by, and what reads the set, by that file's name."""
 
 
 def drive_set_files(folder: Path) -> list[Path]:

@@ -16,14 +16,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 
 from rfcore.camera import Pose
 from rfcore.dataset.arrow_file import arrow_metadata, arrow_rows, opened_arrow
 from rfcore.dataset.bag_transforms import Edge
-from rfcore.dataset.drive_set import Shot, pinhole_of_matrix, posed_source
+from rfcore.dataset.drive_set import US, Shot, pinhole_of_matrix, posed_source
 from rfcore.dataset.keys import lens_of, pose_of_quaternion, table_at
-from rfcore.dataset.picture_file import file_inside
+from rfcore.dataset.picture_file import file_inside, is_whole_jpeg, require_size
 from rfcore.dataset.source import Source, SourceCamera
 from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError
@@ -33,8 +34,6 @@ from rfcore.tables import Table
 SYNC = "sync.arrow"
 """The file by which a log is recognised."""
 EGO = "ego_state_se3"
-US = 1000
-JPEG, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 LENS = ("k1", "k2", "p1", "p2", "k3")
 
 
@@ -154,15 +153,11 @@ class _Pictures:
         batch, row = self._places[number]
         with opened_arrow(self._file, [self._column]) as content:
             data = content.get_batch(batch).column(0)[row].as_py()
-        if data is None or (data.startswith(JPEG) and JPEG_END not in data):
+        if data is None or not is_whole_jpeg(BytesIO(data)):
             raise DatasetError(f"{where}: its picture is missing or cut")
         return self._checked(where, partial(rgb_from_bytes, data, where))
 
     def _checked(self, where: str, read: Callable[[], Rgb]) -> Rgb:
-        rgb, k = read(), self._camera.intrinsics
-        if rgb.shape[:2] != (k.height_px, k.width_px):
-            raise DatasetError(
-                f"{where}: picture is {rgb.shape[1]}x{rgb.shape[0]} px, its camera says "
-                f"{k.width_px}x{k.height_px}"
-            )
+        rgb = read()
+        require_size(where, (rgb.shape[1], rgb.shape[0]), self._camera.intrinsics)
         return rgb

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from rfcore.camera import Pose
 from rfcore.dataset.bag_transforms import Edge
-from rfcore.dataset.drive_set import Shot, pinhole_of_matrix, posed_source
+from rfcore.dataset.drive_set import US, Shot, pinhole_of_matrix, posed_source
 from rfcore.dataset.keys import pose_of_quaternion, table_at
 from rfcore.dataset.picture_file import file_inside
 from rfcore.dataset.source import Source
@@ -27,7 +27,6 @@ from rfcore.tables import Table
 
 TABLE = "sample_data.json"
 """The table by which a set is recognised."""
-US = 1000
 CHUNK = 1 << 20
 MAX_ROW = 1 << 24
 NOTES = ("world: nuScenes' global map, metres, x east, y north, z up",)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path, PurePosixPath
 from posixpath import normpath
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from rfcore.dataset.picture_header import (
 )
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, read_frame, read_pixels
-from rfcore.pixels import Pixels
+from rfcore.pixels import Pixels, pixels_of
 from rfcore.tables import shortened
 from rfcore.views import Mask
 
@@ -220,7 +220,7 @@ class MaskFile:
         frame = read_frame(self.path)
         if frame.format.name in ("gray16be", "gray16le"):
             return np.asarray(frame.to_ndarray())
-        pixels = read_pixels(self.path)
+        pixels = pixels_of(frame, str(self.path))
         values = np.asarray(pixels.rgb.max(axis=2))
         if pixels.opaque is not None and values.min() == values.max():
             return pixels.opaque.astype(np.uint8)
@@ -277,14 +277,15 @@ def picture_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def require_size(path: Path, size_px: tuple[int, int], intrinsics: Intrinsics) -> None:
+def require_size(where: Path | str, size_px: tuple[int, int], intrinsics: Intrinsics) -> None:
+    """Raise ``DatasetError`` for a picture larger than any may be, or not of its camera's size."""
     if max(size_px) > MAX_SIDE_PX:
         raise DatasetError(
-            f"{path}: picture is {size_px[0]}x{size_px[1]} px, over the limit of {MAX_SIDE_PX} px"
+            f"{where}: picture is {size_px[0]}x{size_px[1]} px, over the limit of {MAX_SIDE_PX} px"
         )
     if size_px != (intrinsics.width_px, intrinsics.height_px):
         raise DatasetError(
-            f"{path}: picture is {size_px[0]}x{size_px[1]} px, its camera says "
+            f"{where}: picture is {size_px[0]}x{size_px[1]} px, its camera says "
             f"{intrinsics.width_px}x{intrinsics.height_px}"
         )
 
@@ -308,11 +309,17 @@ def _require_length(path: Path, intrinsics: Intrinsics) -> None:
 
 
 def _require_whole_jpeg(path: Path) -> None:
-    """FFmpeg fills what is missing of a JPEG with grey and reports nothing.
-
-    In a scan 0xFF is followed by 0 or a restart marker only, so that an end marker is one.
-    """
     with path.open("rb") as file:
-        is_jpeg = file.read(2) == b"\xff\xd8"
-        if is_jpeg and not (JPEG_SCAN in jpeg_segments(file) and JPEG_END in file.read()):
+        if not is_whole_jpeg(file):
             raise DatasetError(f"{path}: truncated, the JPEG has no end marker")
+
+
+def is_whole_jpeg(file: BinaryIO) -> bool:
+    """Return whether a file, from its start on, is no JPEG or one with an end.
+
+    FFmpeg fills what is missing of a JPEG with grey and reports nothing. In a scan 0xFF is followed
+    by 0 or a restart marker only, so that an end marker is one.
+    """
+    if file.read(2) != b"\xff\xd8":
+        return True
+    return JPEG_SCAN in jpeg_segments(file) and JPEG_END in file.read()

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO, Literal
 
@@ -107,14 +108,15 @@ def picture_header(path: Path) -> PictureHeader:
 def _tiff(path: Path) -> tuple[Orientation, bytes]:
     """Return a TIFF's orientation and ICC profile; raise ``DatasetError`` for JPEG inside it, of
     which FFmpeg shows wrong colours."""
-    data = path.read_bytes()
-    tags = _directory(data)
-    if tags.get(COMPRESSION_TAG, (0, 0, 0))[2] in JPEG_COMPRESSIONS:
-        raise DatasetError(
-            f"{path}: JPEG compression inside TIFF is not read; export the picture as JPEG or PNG"
-        )
-    _, length, at = tags.get(PROFILE_TAG, (0, 0, 0))
-    return _orientation(data), data[at : at + min(length, MAX_PROFILE_BYTES)]
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        tags = _directory(data)
+        if tags.get(COMPRESSION_TAG, (0, 0, 0))[2] in JPEG_COMPRESSIONS:
+            raise DatasetError(
+                f"{path}: JPEG compression inside TIFF is not read; export the picture as JPEG or "
+                "PNG"
+            )
+        _, length, at = tags.get(PROFILE_TAG, (0, 0, 0))
+        return _turn_of(tags), data[at : at + min(length, MAX_PROFILE_BYTES)]
 
 
 def _avif_profile(path: Path) -> bytes:
@@ -242,11 +244,15 @@ def _profiled(treatment: str | None, profile: bytes) -> tuple[str | None, str | 
 
 def _orientation(exif: bytes) -> Orientation:
     """Return the orientation of a TIFF header with its first directory; upright without one."""
-    _, _, number = _directory(exif).get(ORIENTATION_TAG, (0, 0, 1))
+    return _turn_of(_directory(exif))
+
+
+def _turn_of(tags: dict[int, tuple[int, int, int]]) -> Orientation:
+    _, _, number = tags.get(ORIENTATION_TAG, (0, 0, 1))
     return Orientation(number) if 1 <= number <= 8 else Orientation.UPRIGHT
 
 
-def _directory(tiff: bytes) -> dict[int, tuple[int, int, int]]:
+def _directory(tiff: bytes | mmap) -> dict[int, tuple[int, int, int]]:
     """Return type, count and value (or where it lies) of each tag of a TIFF's first directory."""
     if tiff[:2] not in (b"II", b"MM"):
         return {}

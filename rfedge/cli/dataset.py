@@ -43,7 +43,7 @@ class DatasetConvert:
     offset: int = 0
     """Number of first pictures to leave out."""
     topics: Annotated[tuple[str, ...], arg(metavar="TOPIC ...")] = ()
-    """Of a bag with several cameras or poses, the topics of those that are meant."""
+    """The topics that are meant, of a bag with several cameras or poses."""
 
     def run(self) -> None:
         """Convert; the folder appears when all of it is there."""

@@ -48,7 +48,7 @@ SHA256 = {
     "vgg16": "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
 }
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of samples of -1..1, by channel."""
+"""For samples of -1..1, by channel."""
 EPSILON = 1e-10
 LEAST_PX = 32
 """A smaller picture has no features after AlexNet's last maximum."""

@@ -24,7 +24,7 @@ class PictureCoder(ClipCoder, BoundedCoder, Protocol):
 
 
 class FrameNotes(Protocol):
-    """What is noted of the decoded pictures of a clip."""
+    """Notes on the decoded pictures of a clip."""
 
     @property
     def version(self) -> str:

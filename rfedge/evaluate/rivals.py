@@ -141,7 +141,7 @@ class Rival:
 
         Raises ``CodecError`` as ``code`` does.
         """
-        decoder = self._decoder()
+        decoder = _decoder(self.decoder)
         took_ms, began_ns = [], process_time_ns()
         for packet in self._packets(frames, rate_hz, point):
             coded_ns = process_time_ns()
@@ -184,14 +184,7 @@ class Rival:
         return encoder
 
     def _decoded(self, packets: Sequence[bytes], size_px: tuple[int, int]) -> list[I420]:
-        decoder = self._decoder()
-        frames = [f for packet in packets for f in decoder.decode(av.Packet(packet))]
-        return [picture_of(frame).cropped(size_px) for frame in (*frames, *decoder.decode(None))]
-
-    def _decoder(self) -> av.VideoCodecContext:
-        decoder = _opened(self.decoder, "r")
-        decoder.thread_count = 1
-        return decoder
+        return [picture.cropped(size_px) for picture in decoded_pictures(self.decoder, packets)]
 
 
 @cache
@@ -321,6 +314,19 @@ def svtav1_lowdelay(preset: int) -> Rival:
         SVT_CRFS,
         SVT_LIMITS,
     )
+
+
+def decoded_pictures(codec: str, packets: Sequence[bytes]) -> list[I420]:
+    """Return the pictures that FFmpeg's decoder ``codec`` makes of packets, on one thread."""
+    decoder = _decoder(codec)
+    frames = [frame for packet in packets for frame in decoder.decode(av.Packet(packet))]
+    return [picture_of(frame) for frame in (*frames, *decoder.decode(None))]
+
+
+def _decoder(codec: str) -> av.VideoCodecContext:
+    decoder = _opened(codec, "r")
+    decoder.thread_count = 1
+    return decoder
 
 
 def _opened(codec: str, mode: Literal["r", "w"]) -> av.VideoCodecContext:

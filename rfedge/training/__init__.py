@@ -352,8 +352,8 @@ class Train:
         if self.minutes is not None:
             limit = DEFAULT_LIMIT if limit is None else limit
             config = replace(config, halved_until=HALVED_UNTIL)
-        sizes_px = [picture.camera.intrinsics for picture in dataset.pictures]
-        if min(k.width_px * k.height_px for k in sizes_px) > LARGE_PX:
+        cameras = [picture.camera.intrinsics for picture in dataset.pictures]
+        if min(k.width_px * k.height_px for k in cameras) > LARGE_PX:
             config = replace(config, halved_until=LARGE_HALVED_UNTIL)
         if limit is not None:
             config = replace(config, density=DensityControl(limit=limit))

@@ -39,11 +39,11 @@ log = structlog.get_logger()
 
 SERVICES = tuple(f"{name}.grpc.protos.sensorsim.SensorsimService" for name in ("nre", "nurec"))
 API_VERSION = (0, 54, 0)
-"""Of the contract that was read."""
+"""The version of the contract that was read."""
 MOST_WAITING = 16
 """Calls at once, and pictures of a call; more are refused."""
 PNG_LEVEL = 1
-"""Of zlib: 6, the default, takes five times as long for 12 % fewer bytes."""
+"""zlib's level: 6, the default, takes five times as long for 12 % fewer bytes."""
 NOT_DRAWN = "rfedge-not-drawn"
 UNIMPLEMENTED, INVALID = grpc.StatusCode.UNIMPLEMENTED, grpc.StatusCode.INVALID_ARGUMENT
 FORMATS = {wire.IMAGE_FORMAT_PNG: "PNG", wire.IMAGE_FORMAT_JPEG: "JPEG"}
