@@ -5,6 +5,9 @@ frames: edit lists hide some, AVI and raw H.264 state no times, broadcasts begin
 group of pictures. Times are those of the frames, counted from the first one; where they are missing
 or go back, frames are evenly spaced at the file's rate, which is said.
 
+A raw stream states neither how many frames it has nor which of them is which. One that was cut
+between a picture and the B pictures before it lacks these, and nothing tells.
+
 Frames are read cheaply in order. MP4 and Matroska are sought at key frames. In other containers a
 seek may end anywhere, so an earlier frame is counted from the beginning again.
 
@@ -57,6 +60,8 @@ WHITELIST = ",".join(name for name in av.formats_available if name.split(",")[0]
 STILLS = ("avif", "heic", "heix", "heim", "heis", "mif1")
 """Brands of MP4 that are pictures, HEIF's."""
 SOUGHT = ("mov", "matroska")
+LEAST_CUT_S = 0.25
+"""Sound often ends so much later than the pictures."""
 TURNED_LEFT = {90: 8, 180: 3, -180: 3, -90: 6, 270: 6}
 """Orientation by a frame's rotation in degrees, counter-clockwise."""
 
@@ -235,6 +240,8 @@ def _index(file: Path) -> VideoIndex:
         if not is_stated:
             rate = _rate_hz(file, stream, len(pts))
             notes.append(f"frames state no times in order: {float(rate):g} a second are taken")
+        if (cut := _cut(container, times_ns)) is not None:
+            notes.append(cut)
     size_px = (first.width, first.height)
     return VideoIndex(
         times_ns, tuple(pts), tuple(keys) if seekable else (0,), size_px, orientation, tuple(notes)
@@ -285,6 +292,16 @@ def _times_ns(
         return tuple(round((tick - stated[0]) * tick_ns) for tick in stated), True
     period_ns = 1_000_000_000 / _rate_hz(file, stream, len(pts))
     return tuple(round(number * period_ns) for number in range(len(pts))), False
+
+
+def _cut(container: InputContainer, times_ns: tuple[int, ...]) -> str | None:
+    """Return a line if the frames end long before the length that the file states."""
+    stated_s = ((container.duration or 0) - max(container.start_time or 0, 0)) / 1e6
+    shown_s = times_ns[-1] / 1e9 * (1 + 1 / max(len(times_ns) - 1, 1))
+    period_s = shown_s / len(times_ns)
+    if stated_s - shown_s <= max(LEAST_CUT_S, 2 * period_s):
+        return None
+    return f"frames end after {shown_s:.2f} s of the {stated_s:.2f} s stated: the file may be cut"
 
 
 def _rate_hz(file: Path, stream: VideoStream, count: int) -> Fraction:
