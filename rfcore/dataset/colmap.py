@@ -104,7 +104,8 @@ def camera_parameters(camera: SourceCamera) -> tuple[str, list[float]]:
     elif isinstance(lens, FisheyeLens):
         name = "OPENCV_FISHEYE"
     else:
-        name = "FULL_OPENCV" if getattr(lens, "k3", 0.0) else "OPENCV"
+        beyond = any(getattr(lens, key, 0.0) for key in ("k3", "k4", "k5", "k6"))
+        name = "FULL_OPENCV" if beyond else "OPENCV"
     coefficients = [float(getattr(lens, key, 0.0)) for key in LENS_MODELS[name].coefficients]
     return name, [k.fx_px, k.fy_px, k.cx_px, k.cy_px, *coefficients]
 

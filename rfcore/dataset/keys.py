@@ -155,6 +155,7 @@ class LensModel:
 
 
 BROWN, KANNALA = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
+RATIONAL = (*BROWN, "k4", "k5", "k6")
 THIN_PRISM = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
 RAD_TAN = (*(f"k{i}" for i in range(6)), "p0", "p1", *(f"s{i}" for i in range(4)))
 LENS_MODELS = {
@@ -164,7 +165,7 @@ LENS_MODELS = {
     "RADIAL": LensModel(3, 1, ("k1", "k2"), ("k1", "k2")),
     "OPENCV": LensModel(4, 2, BROWN[:4], BROWN),
     "OPENCV_FISHEYE": LensModel(5, 2, KANNALA, KANNALA, fisheye=True),
-    "FULL_OPENCV": LensModel(6, 2, (*BROWN, "k4", "k5", "k6"), BROWN),
+    "FULL_OPENCV": LensModel(6, 2, RATIONAL, RATIONAL),
     "FOV": LensModel(7, 2, ("omega",), ()),
     "SIMPLE_RADIAL_FISHEYE": LensModel(8, 1, ("k1",), ("k1",), fisheye=True),
     "RADIAL_FISHEYE": LensModel(9, 1, ("k1", "k2"), ("k1", "k2"), fisheye=True),

@@ -10,7 +10,8 @@
     fy_px = 1050.0                  # default: fx_px
     cx_px = 960.0                   # default: the middle
     cy_px = 540.0
-    k1 = -0.1                       # the lens: k1 k2 p1 p2 k3, or k1..k4 of OPENCV_FISHEYE
+    k1 = -0.1                       # the lens: k1 k2 p1 p2 k3 (k4 k5 k6 of FULL_OPENCV)
+                                    #   or k1..k4 of OPENCV_FISHEYE
 
     [pictures]
     video = "drive.mp4"             # or folder = "frames", in the order of the names, with
@@ -68,7 +69,7 @@ from rfcore.tables import Range, Table
 from rfcore.views import Mask
 
 SECTIONS = {
-    "camera": "model width_px height_px fx_px fy_px cx_px cy_px k1 k2 k3 k4 p1 p2",
+    "camera": "model width_px height_px fx_px fy_px cx_px cy_px k1 k2 k3 k4 k5 k6 p1 p2",
     "pictures": "video folder rate_hz times every bag topics",
     "trajectory": "file time_offset_s max_gap_s outside body_from_cam",
     "points": "file",

@@ -82,8 +82,11 @@ def _frame(picture: WrittenPicture, own_camera: bool) -> dict[str, Any]:
 
 
 def _camera_keys(camera: SourceCamera) -> dict[str, Any]:
-    model = "OPENCV_FISHEYE" if isinstance(camera.lens, FisheyeLens) else "OPENCV"
     lens = {} if camera.lens is None else asdict(camera.lens)  # type: ignore[call-overload]
+    if isinstance(camera.lens, FisheyeLens):
+        model = "OPENCV_FISHEYE"
+    else:  # OPENCV of nerfstudio has a k4 of its own
+        model = "FULL_OPENCV" if any(lens.get(key) for key in ("k4", "k5", "k6")) else "OPENCV"
     return {"camera_model": model, **_intrinsics_keys(camera.intrinsics), **lens}
 
 

@@ -397,7 +397,15 @@ def test_a_picture_shorter_than_its_header_says_is_refused(tmp_path):
         read_source(one_picture(message).write(tmp_path / "bag"))
 
 
-@pytest.mark.parametrize("d", [(0.1, 0.2), (0.1, 0, 0, 0, 0, 0.3, 0, 0)])
+def test_the_rational_polynomial_is_read(tmp_path):
+    d = (0.1, 0.02, 1e-3, 2e-3, 0.01, 0.3, 0.05, 0.01)
+    info = bags.camera_info(time_ns(0), SIZE_PX, d=d, model="rational_polynomial")
+    message = bags.rgb_image(time_ns(0), bags.rgb(0))
+    source = read_source(one_picture(message, info).write(tmp_path / "bag"))
+    assert source.pictures[0].camera.lens == BrownLens(*d)
+
+
+@pytest.mark.parametrize("d", [(0.1, 0.2), (0.1, 0, 0, 0, 0, 0, 0, 0, 0.3)])
 def test_lenses_that_are_not_read_are_refused(tmp_path, d):
     info = bags.camera_info(time_ns(0), SIZE_PX, d=d, model="rational_polynomial")
     message = bags.rgb_image(time_ns(0), bags.rgb(0))

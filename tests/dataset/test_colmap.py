@@ -31,7 +31,7 @@ PARAMETERS = {
     "RADIAL": [400.0, 322.0, 178.0, -0.05, 0.01],
     "OPENCV": [400.0, 410.0, 322.0, 178.0, -0.05, 0.01, 1e-3, -2e-3],
     "OPENCV_FISHEYE": [400.0, 410.0, 322.0, 178.0, -0.02, 0.01, 1e-3, -2e-3],
-    "FULL_OPENCV": [400.0, 410.0, 322.0, 178.0, -0.05, 0.01, 1e-3, -2e-3, 3e-3, 0, 0, 0],
+    "FULL_OPENCV": [400.0, 410.0, 322.0, 178.0, -0.05, 0.01, 1e-3, -2e-3, 3e-3, 0.2, -0.03, 5e-3],
     "SIMPLE_RADIAL_FISHEYE": [400.0, 322.0, 178.0, -0.02],
     "RADIAL_FISHEYE": [400.0, 322.0, 178.0, -0.02, 0.01],
     "SIMPLE_FISHEYE": [400.0, 322.0, 178.0],
@@ -75,7 +75,6 @@ def test_the_table_of_models_is_colmaps():
 @pytest.mark.parametrize(
     ("model", "lens", "named"),
     [
-        ("FULL_OPENCV", [0, 0, 0, 0, 0, 0.1, 0, 0], "k4 = 0.1 of camera_model FULL_OPENCV"),
         ("THIN_PRISM_FISHEYE", [0, 0, 0.1, 0, 0, 0, 0, 0.2], "p1 = 0.1, sy1 = 0.2"),
         ("FOV", [0.9], "omega = 0.9"),
         ("EUCM", [0.5, 1.0], "alpha = 0.5, beta = 1"),

@@ -1,5 +1,7 @@
 """An undistorted picture is what a pinhole would have seen: straight lines, no blank edges."""
 
+from dataclasses import astuple
+
 import cv2
 import numpy as np
 import pytest
@@ -44,15 +46,21 @@ def test_every_pixel_shows_its_own_direction(lens):
     assert error.mean() < 0.5
 
 
-def test_the_pixels_are_opencvs():
+@pytest.mark.parametrize(
+    "lens",
+    [
+        BrownLens(k1=0.06, k2=-0.08, p1=-1e-3, p2=1.5e-4),
+        BrownLens(0.4, 0.1, 1e-3, -2e-3, 0.02, 0.6, 0.15, 0.03),
+    ],
+)
+def test_the_pixels_are_opencvs(lens):
     """OpenCV counts pixel centres from 0; its weights have 5 bits, which is 120 / 32 / 8 levels."""
-    lens = BrownLens(k1=0.06, k2=-0.08, p1=-1e-3, p2=1.5e-4)
     pinhole, rgb = pinhole_of(K, lens), seen_through(lens)
     source, target = (
         np.array([[k.fx_px, 0, k.cx_px - 0.5], [0, k.fy_px, k.cy_px - 0.5], [0, 0, 1]])
         for k in (K, pinhole)
     )
-    coefficients = np.array([lens.k1, lens.k2, lens.p1, lens.p2])
+    coefficients = np.array(astuple(lens))
     maps = cv2.initUndistortRectifyMap(
         source, coefficients, None, target, (K.width_px, K.height_px), cv2.CV_32FC1
     )

@@ -1,6 +1,7 @@
 """A dataset written as transforms.json is read back the same."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from rfcore.files import whole_folder
 from rfcore.image import write_png
 from rfcore.lens import BrownLens, FisheyeLens
 
+BROWN = BrownLens(0.1, -0.2, 1e-3, 2e-3, 0.05)
+LENSES = [None, BROWN, replace(BROWN, k4=0.3, k6=-0.01), FisheyeLens(0.1)]
 K = Intrinsics(8, 6, 7.5, 7.25, 4.125, 2.875)
 FAR = Pose((691_608.125, 5_334_760.0625, 519.5), (0.5, -0.5, 0.5, -0.5))
 TURNED = Pose((1.0, 2.0, 3.0), (math.cos(0.3), 0.0, math.sin(0.3), 0.0))
@@ -32,7 +35,7 @@ def written(folder: Path, cameras: list[SourceCamera]) -> list[WrittenPicture]:
     return pictures
 
 
-@pytest.mark.parametrize("lens", [None, BrownLens(0.1, -0.2, 1e-3, 2e-3, 0.05), FisheyeLens(0.1)])
+@pytest.mark.parametrize("lens", LENSES)
 def test_poses_lenses_and_points_come_back_exactly(lens, tmp_path):
     pictures = written(tmp_path, [SourceCamera(K, lens)] * 2)
     source = read_source(tmp_path)

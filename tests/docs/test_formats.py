@@ -371,8 +371,7 @@ UNREAD = "refused, with the command of COLMAP's image_undistorter", "colmap imag
 LENSES = [
     ("PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV", "OPENCV", [0.01, 0, 0, 0], READ),
     ("OPENCV_FISHEYE, RADIAL_FISHEYE, FISHEYE, SIMPLE ones", "RADIAL_FISHEYE", [0.01, 0], READ),
-    ("FULL_OPENCV, k4 to k6 zero", "FULL_OPENCV", [0.01, 0, 0, 0, 0.001, 0, 0, 0], READ),
-    ("FULL_OPENCV, others", "FULL_OPENCV", [0.01, 0, 0, 0, 0, 0.1, 0, 0], UNREAD),
+    ("FULL_OPENCV", "FULL_OPENCV", [0.01, 0, 0, 0, 0.001, 0.1, 0, 0], READ),
     ("THIN_PRISM_FISHEYE, FOV, EUCM, DIVISION, others", "FOV", [0.4], UNREAD),
 ]
 
