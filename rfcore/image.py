@@ -7,6 +7,7 @@ BT.709 coefficients and limited range, of the codec. The exact conversion betwee
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from fractions import Fraction
 from io import BytesIO
@@ -185,12 +186,26 @@ def frame_from_bytes(data: bytes, source: str) -> av.VideoFrame:
     """
     try:
         with av.open(
-            BytesIO(data), "r", options={"format_whitelist": PICTURE_FORMATS}
+            BytesIO(_top_row_first(data)), "r", options={"format_whitelist": PICTURE_FORMATS}
         ) as container:
             _check_pixels(source, container.streams.video[0])
             return next(container.decode(video=0))
     except (FFmpegError, OSError, StopIteration, IndexError) as error:
         raise DatasetError(f"{source}: not a readable picture ({error})") from error
+
+
+def _top_row_first(data: bytes) -> bytes:
+    """Return a PFM, whose rows run from the bottom up, upside down; FFmpeg does not turn it."""
+    head = re.match(rb"P([Ff])\s+(\d{1,5})\s+(\d{1,5})\s+\S+\s", data)
+    if head is None:
+        return data
+    start, kind, width, height = head.end(), *head.groups()
+    row_bytes = int(width) * (12 if kind == b"F" else 4)
+    end = start + int(height) * row_bytes
+    if end > len(data):
+        return data
+    rows = (data[at : at + row_bytes] for at in range(start, end, row_bytes))
+    return data[:start] + b"".join(reversed(list(rows)))
 
 
 def _check_pixels(source: str, stream: av.VideoStream) -> None:

@@ -2,9 +2,10 @@ r"""Posed pictures from a COLMAP model and the folder ``images`` it was made fro
 
 The model lies in ``sparse/N``, ``sparse`` or the folder itself, in text or binary form (binary is
 preferred, as in COLMAP). Of several models the one with most pictures is read, which is said.
-Pictures are in the order of their names. Poses are cam_from_world with OpenCV camera axes,
-quaternions w, x, y, z; pixel centres are at +0.5 as here. Both forms are described in COLMAP's
-documentation, "Output Format".
+Pictures lie in ``images``, ``input`` or, as copies of another size, ``images_2``, ``images_4`` or
+``images_8``; names may begin with that folder. They are in the order of their names. Poses are
+cam_from_world with OpenCV camera axes, quaternions w, x, y, z; pixel centres are at +0.5 as here.
+Both forms are described in COLMAP's documentation, "Output Format".
 
 Binary, little-endian (``cameras.bin``, ``images.bin``, ``points3D.bin``)::
 
@@ -41,7 +42,7 @@ from rfcore.dataset.keys import (
     table_at,
     text_lines,
 )
-from rfcore.dataset.picture_file import PictureFile, find_picture
+from rfcore.dataset.picture_file import file_inside, find_picture, posed_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
 from rfcore.errors import DatasetError
 from rfcore.lens import FisheyeLens
@@ -49,6 +50,8 @@ from rfcore.tables import shortened
 
 MODEL_NAMES = {model.number: name for name, model in LENS_MODELS.items()}
 MAX_NAME = 60
+IMAGES, DISTORTED = "images", "distorted"
+"""Folder of pictures, and that of INRIA's model of the pictures in ``input``, with their lens."""
 
 
 @dataclass(frozen=True)
@@ -299,14 +302,16 @@ def read_colmap_source(model_folder: Path, others: Sequence[Path] = ()) -> Sourc
     Raises ``DatasetError`` naming the file.
     """
     file = images_file(model_folder)
-    images_folder = _images_folder(model_folder)
+    folders = _images_folders(model_folder)
     read = read_text_model if file is not None and file.suffix == ".txt" else read_binary_model
-    model = read(model_folder, _undistorter(model_folder, images_folder))
+    model = read(model_folder, _undistorter(model_folder, folders[0]))
     ordered = sorted(model.images, key=lambda image: image.name)
-    notes = []
+    images_folder, notes = _folder_of(ordered, folders), list[str]()
+    if images_folder.name != IMAGES:
+        notes.append(f"pictures are taken from {images_folder}")
     if others:
         left = ", ".join(f"{other} of {_image_count(other)}" for other in others)
-        notes = [f"{model_folder} is read, of {len(ordered)} pictures; not read: {left}"]
+        notes.append(f"{model_folder} is read, of {len(ordered)} pictures; not read: {left}")
     return Source(
         file=file or model_folder / "images.bin",
         pictures=tuple(_picture(model, images_folder, image) for image in ordered),
@@ -322,12 +327,26 @@ def _undistorter(model_folder: Path, images_folder: Path) -> str:
     return f"; undistort them: colmap image_undistorter {command} --output_path undistorted"
 
 
-def _images_folder(model_folder: Path) -> Path:
+def _images_folders(model_folder: Path) -> list[Path]:
+    """Return the folders that the pictures may be in, the likeliest first."""
     above = (model_folder, *model_folder.absolute().parents[:2])
-    for candidate in (folder / "images" for folder in above):
-        if candidate.is_dir():
-            return candidate
-    raise DatasetError(f"{model_folder}: no folder 'images' beside the model or two levels above")
+    kinds = (IMAGES, "input", *(f"{IMAGES}_{scale}" for scale in (2, 4, 8)))
+    named = [folder / kind for kind in kinds for folder in above]
+    if above[-1].name == DISTORTED:
+        named.insert(0, above[-1].parent / "input")
+    there = [folder for folder in named if folder.is_dir()]
+    if not there:
+        raise DatasetError(
+            f"{model_folder}: no folder '{IMAGES}' or 'input' beside the model or two levels above"
+        )
+    return [*there, *(folder.parent for folder in there)]
+
+
+def _folder_of(images: Sequence[ColmapImage], folders: Sequence[Path]) -> Path:
+    """Return the first folder that has the first picture; the likeliest if none has."""
+    first = images[:1]
+    found = (f for f in folders for one in first if file_inside(one.where, f, one.name))
+    return next(found, folders[0])
 
 
 def _picture(model: ColmapModel, folder: Path, image: ColmapImage) -> SourcePicture:
@@ -335,13 +354,5 @@ def _picture(model: ColmapModel, folder: Path, image: ColmapImage) -> SourcePict
     if camera is None:
         raise DatasetError(f"{image.where}: camera {image.camera_id} is not in the model")
     path = find_picture(image.where, folder, image.name)
-    opened = PictureFile.of(path, camera.intrinsics)
-    return SourcePicture(
-        where=image.where,
-        name=image.name,
-        camera=camera,
-        world_from_cam=image.cam_from_world.inverse(),
-        read=opened.read,
-        mask=opened.mask,
-        notes=opened.notes,
-    )
+    world_from_cam = image.cam_from_world.inverse()
+    return posed_picture(image.where, image.name, path, camera, world_from_cam)

@@ -1,12 +1,15 @@
 """Picture files of a dataset: where they are, how large, and which of their pixels count.
 
 A picture is read as it is stored or, where only that fits its camera, turned as its EXIF
-orientation says: COLMAP, instant-ngp and nerfstudio know nothing of EXIF. Its mask is the file that
+orientation says: COLMAP, instant-ngp and nerfstudio know nothing of EXIF. Where pictures are copies
+of another size (``images_4``), the camera is scaled to them. A name that differs from its file's in
+upper and lower case alone finds it. A picture's mask is the file that
 the dataset names, or one beside the pictures: ``masks/NAME.png``, ``masks/STEM.png`` or
 ``masks/STEM_mask.png`` next to the folder ``images`` (COLMAP, gsplat, LichtFeld Studio, Metashape),
 ``NAME.mask.png``, ``STEM.mask.png`` or ``STEM_mask.png`` in the picture's folder (RealityScan,
 OpenDroneMap), or instant-ngp's ``dynamic_mask_STEM.png``.
-White is learnt and measured, black is not, but for instant-ngp's masks, which are white where
+A mask of another size and the same shape is scaled. White is learnt and measured, black is not, but
+for instant-ngp's masks, which are white where
 something moves. A transparent pixel is not learnt either.
 """
 
@@ -14,7 +17,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
-from itertools import product
+from functools import lru_cache
+from itertools import product, takewhile
 from pathlib import Path, PurePosixPath
 from posixpath import normpath
 from typing import Any, BinaryIO
@@ -22,7 +26,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import MAX_SIDE_PX, Intrinsics
+from rfcore.camera import MAX_SIDE_PX, Intrinsics, Pose
 from rfcore.dataset.colour_profile import OTHER_PROFILE, PRIMARIES
 from rfcore.dataset.orientation import Orientation
 from rfcore.dataset.picture_header import (
@@ -31,6 +35,7 @@ from rfcore.dataset.picture_header import (
     picture_format,
     picture_header,
 )
+from rfcore.dataset.source import SourceCamera, SourcePicture
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, read_frame, read_pixels
 from rfcore.pixels import Pixels, pixels_of
@@ -42,6 +47,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG", ".WEBP")
 MASK_FOLDERS, MASK_SUFFIXES = ("masks", "mask", "Masks"), (*SUFFIXES, ".tif", ".tiff")
 MAX_PART_BYTES = 255
 """Longest file name of Linux file systems."""
+LEAST_SCALE = 1.1
+"""Sizes that are closer to each other are of a picture that was cropped, not scaled."""
 JPEG_SCAN = 0xDA
 JPEG_END = b"\xff\xd9"
 
@@ -94,16 +101,76 @@ def find_picture(where: str, folder: Path, name: str) -> Path:
 def file_inside(where: str, folder: Path, name: str) -> Path | None:
     """Return the file or ``None``; a name without suffix may mean any of PNG, JPEG, WebP."""
     path = _inside(where, folder, name)
-    return None if path is None else _existing(path)
+    return None if path is None or path == folder else _existing(path)
 
 
 def _existing(path: Path) -> Path | None:
-    if path.is_file():
+    suffixes = ("",) if path.suffix in SUFFIXES else ("", *SUFFIXES)
+    named = [path.with_name(path.name + suffix) for suffix in suffixes]
+    found = next((candidate for candidate in named if candidate.is_file()), None)
+    if found is not None:
+        return found
+    others = {other for name in named if (other := _in_other_case(name)) and other.is_file()}
+    return others.pop() if len(others) == 1 else None
+
+
+def _in_other_case(path: Path) -> Path | None:
+    """Return what is called so but for upper and lower case, ``None`` unless just one is."""
+    if path.exists():
         return path
-    if path.suffix in SUFFIXES:
+    if path.parent == path or (folder := _in_other_case(path.parent)) is None:
         return None
-    named = (path.with_name(path.name + suffix) for suffix in SUFFIXES)
-    return next((candidate for candidate in named if candidate.is_file()), None)
+    if not folder.is_dir() or (folder / path.name).exists():
+        return folder / path.name
+    names = _names_by_case(folder, folder.stat().st_mtime_ns).get(path.name.casefold(), [])
+    return folder / names[0] if len(names) == 1 else None
+
+
+@lru_cache(maxsize=16)
+def _names_by_case(folder: Path, _: int) -> dict[str, list[str]]:
+    """Return a folder's names by what they are in lower case, as of its time of change."""
+    names: dict[str, list[str]] = {}
+    for path in folder.iterdir():
+        names.setdefault(path.name.casefold(), []).append(path.name)
+    return names
+
+
+def _differs_in_case(path: Path, name: str) -> bool:
+    """Return whether the file that was found for a name has other letters in its path."""
+    asked = PurePosixPath(normpath(name.replace("\\", "/"))).parts[::-1]
+    pairs = list(zip(asked, path.parts[::-1], strict=False))
+    if not pairs[0][1].startswith(pairs[0][0]):
+        return True
+    same = takewhile(lambda pair: pair[0].casefold() == pair[1].casefold(), pairs[1:])
+    return any(a != b for a, b in same)
+
+
+def posed_picture(
+    where: str,
+    name: str,
+    path: Path,
+    camera: SourceCamera,
+    world_from_cam: Pose,
+    *,
+    time_ns: int | None = None,
+    mask: MaskFile | None = None,
+) -> SourcePicture:
+    """Return the picture that a dataset calls ``name``; its camera is scaled to the file's size.
+
+    Raises ``DatasetError`` for a size of another shape than the camera's.
+    """
+    opened = PictureFile.of(path, camera.intrinsics, mask, may_scale=True)
+    renamed = ("are found under names in other upper and lower case",)
+    return SourcePicture(
+        where=where,
+        name=name.replace("\\", "/"),
+        camera=replace(camera, intrinsics=opened.intrinsics),
+        world_from_cam=world_from_cam,
+        read=opened.read,
+        time_ns=time_ns,
+        mask=opened.mask,
+        notes=opened.notes + (renamed if _differs_in_case(path, name) else ()),
+    )
 
 
 def read_picture(path: Path, intrinsics: Intrinsics) -> Rgb:
@@ -127,12 +194,27 @@ class PictureFile:
     notes: tuple[str, ...]
 
     @staticmethod
-    def of(path: Path, intrinsics: Intrinsics, mask: MaskFile | None = None) -> PictureFile:
-        """Open a picture; raise ``DatasetError`` when its header states another size."""
+    def of(
+        path: Path,
+        intrinsics: Intrinsics,
+        mask: MaskFile | None = None,
+        *,
+        may_scale: bool = False,
+    ) -> PictureFile:
+        """Open a picture; raise ``DatasetError`` when its header states another size.
+
+        ``may_scale``: it may be a copy of another size, to which the intrinsics are scaled.
+        """
         header = picture_header(path)
         wanted_px = (intrinsics.width_px, intrinsics.height_px)
         notes, orientation = [], Orientation.UPRIGHT
         shown_px = header.orientation.size(header.size_px)
+        if may_scale and wanted_px not in (header.size_px, shown_px):
+            fits = (size for size in (header.size_px, shown_px) if _is_scaled(size, wanted_px))
+            if (size_px := next(fits, None)) is not None:
+                (width, height), (before, above) = size_px, wanted_px
+                notes.append(f"are {width}x{height} px: their camera of {before}x{above} is scaled")
+                intrinsics, wanted_px = intrinsics.resized(width, height), size_px
         is_turned = header.orientation is not Orientation.UPRIGHT
         if is_turned and header.size_px != wanted_px == shown_px:
             orientation = header.orientation
@@ -155,7 +237,8 @@ class PictureFile:
             )
         mask = mask or mask_beside(path)
         if mask is not None:
-            notes.append("have a mask: what it hides is not learnt or measured")
+            scaled = " of another size, which is scaled" * mask.is_scaled(wanted_px)
+            notes.append(f"have a mask{scaled}: what it hides is not learnt or measured")
         primaries = PRIMARIES.get(header.profile or "")
         return PictureFile(
             path, intrinsics, orientation, header.has_alpha, primaries, mask, tuple(notes)
@@ -197,7 +280,7 @@ class MaskFile:
     hides_white: bool = False
 
     def read(self, picture: PictureFile) -> Mask:
-        """Return which pixels count, bool [H, W]; raise ``DatasetError`` for another size.
+        """Return which pixels count, bool [H, W]; raise ``DatasetError`` for another shape.
 
         White is what is brighter than half of the brightest: some masks have 0 and 1.
         """
@@ -205,15 +288,24 @@ class MaskFile:
         _require_length(self.path, replace(picture.intrinsics, width_px=width, height_px=height))
         values = self._values()
         is_white = np.asarray(values > values.max() / 2)
-        k = picture.intrinsics
-        if is_white.shape != (k.height_px, k.width_px):
-            is_white = picture.orientation.shown(is_white)
-        if is_white.shape != (k.height_px, k.width_px):
-            raise DatasetError(
-                f"{self.path}: mask is {values.shape[1]}x{values.shape[0]} px, its picture "
-                f"{k.width_px}x{k.height_px}"
-            )
-        return np.asarray(is_white != self.hides_white)
+        size_px = (picture.intrinsics.width_px, picture.intrinsics.height_px)
+        for turned in (is_white, picture.orientation.shown(is_white)):
+            height, width = turned.shape
+            if (width, height) == size_px or _is_scaled((width, height), size_px):
+                rows, columns = (
+                    (np.arange(count) * 2 + 1) * side // (2 * count)
+                    for count, side in ((size_px[1], height), (size_px[0], width))
+                )
+                return np.asarray(turned[rows[:, None], columns] != self.hides_white)
+        raise DatasetError(
+            f"{self.path}: mask is {values.shape[1]}x{values.shape[0]} px, its picture "
+            f"{size_px[0]}x{size_px[1]}; scale it to that size"
+        )
+
+    def is_scaled(self, size_px: tuple[int, int]) -> bool:
+        """Return whether the mask is of another size than its picture, but of the same shape."""
+        mask_px = picture_header(self.path).size_px
+        return _is_scaled(mask_px, size_px) or _is_scaled(mask_px[::-1], size_px)
 
     def _values(self) -> NDArray[np.integer[Any]]:
         """Return the brightness [H, W]: of 16 bits as they are, of one colour its alpha."""
@@ -277,6 +369,16 @@ def picture_paths(folder: Path) -> list[Path]:
     return paths
 
 
+def _is_scaled(size_px: tuple[int, int], from_px: tuple[int, int]) -> bool:
+    """Return whether a picture may be a copy, larger or smaller, of one of another size: its sides
+    are the other's times one factor, each rounded somehow."""
+    (width, height), (from_width, from_height) = size_px, from_px
+    longest = max(*size_px, *from_px)
+    is_off = abs(width * from_height - height * from_width) >= longest
+    least, most = sorted((min(size_px), min(from_px)))
+    return not is_off and most >= LEAST_SCALE * least and longest <= MAX_SIDE_PX
+
+
 def require_size(where: Path | str, size_px: tuple[int, int], intrinsics: Intrinsics) -> None:
     """Raise ``DatasetError`` for a picture larger than any may be, or not of its camera's size."""
     if max(size_px) > MAX_SIDE_PX:
@@ -286,7 +388,7 @@ def require_size(where: Path | str, size_px: tuple[int, int], intrinsics: Intrin
     if size_px != (intrinsics.width_px, intrinsics.height_px):
         raise DatasetError(
             f"{where}: picture is {size_px[0]}x{size_px[1]} px, its camera says "
-            f"{intrinsics.width_px}x{intrinsics.height_px}"
+            f"{intrinsics.width_px}x{intrinsics.height_px}; take pictures or a camera of one size"
         )
 
 

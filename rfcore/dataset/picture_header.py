@@ -36,6 +36,8 @@ SIGNATURES = {
     b"qoif": "QOI",
     b"P5": "PGM",
     b"P6": "PPM",
+    b"PF": "PFM",
+    b"Pf": "PFM",
 }
 UNREAD = ("JPEG XL", "HEIC")
 HEIC = (b"heic", b"heix", b"heim", b"heis", b"mif1")

@@ -17,8 +17,10 @@ the points training started from, ``point_cloud/iteration_N/point_cloud.ply`` th
 ``transform_matrix`` is world_from_camera with OpenGL camera axes (x right, y up, z backward);
 it becomes OpenCV axes here. Intrinsics, camera model and distortion stand at the top and may be
 overridden per frame; where ``fl_y``, ``cx`` or ``cy`` are left out they are ``fl_x`` and the middle
-of the picture, as both programs define it, and ``w`` and ``h`` its size. ``time`` is in seconds.
-Other keys are ignored.
+of the picture, as both programs define it, and ``w`` and ``h`` its size. ``camera_angle_x`` (rad)
+and ``x_fov`` (degrees) may stand for ``fl_x``. ``time`` is in seconds. A key whose value is null
+is absent. Other keys are ignored. With instant-ngp's ``from_mitsuba`` camera axes are x left, y up,
+z forward.
 A frame with instant-ngp's ``sharpness`` whose picture is missing was sorted out as blurred and is
 left out, as that program does; any other missing picture is an error.
 
@@ -58,10 +60,10 @@ from rfcore.dataset.keys import (
 from rfcore.dataset.kitti import OXTS, read_kitti_raw_source, read_kitti_source
 from rfcore.dataset.picture_file import (
     MaskFile,
-    PictureFile,
     file_inside,
     find_picture,
     is_absolute,
+    posed_picture,
 )
 from rfcore.dataset.picture_header import picture_format, picture_header
 from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
@@ -96,9 +98,9 @@ class AppliedTransform:
 
 def read_transforms_source(file: Path) -> Source:
     """Read a transforms file. Raises ``DatasetError`` naming the file, the key and the value."""
-    content = load_json(file)
+    content = _without_nulls(load_json(file))
     top = table_at(str(file), content)
-    frames = top.items("frames")
+    frames = [_without_nulls(frame) for frame in top.items("frames")]
     if not frames:
         raise top.error("frames", "must list at least one frame")
     applied = _applied(str(file), top)
@@ -136,6 +138,13 @@ def transforms_file(folder: Path) -> Path | None:
     return found[0] if found else None
 
 
+def _without_nulls(values: Any) -> Any:
+    """Return a table less its keys of null, with which some programs fill what they do not know."""
+    if not isinstance(values, dict):
+        return values
+    return {key: value for key, value in values.items() if value is not None}
+
+
 def _sorted_out(file: Path, index: int, frame: Any) -> bool:
     if not isinstance(frame, dict) or "sharpness" not in frame:
         return False
@@ -152,20 +161,13 @@ def _picture(file: Path, content: dict[str, Any], index: int, frame: Any) -> Sou
     camera = _camera(where, table_at(where, ChainMap(frame, content)), path)
     rows = keys.matrix("transform_matrix", POSE_SHAPES)
     mask = None
-    if keys.value("mask_path", None) is not None:
+    if "mask_path" in keys:
         mask = MaskFile(find_picture(f"{where}: mask", file.parent, keys.text("mask_path")))
-    opened = PictureFile.of(path, camera.intrinsics, mask)
-    opencv_rows = [[r[0], -r[1], -r[2], r[3]] for r in rows]
-    return SourcePicture(
-        where=where,
-        name=name.replace("\\", "/"),
-        camera=camera,
-        world_from_cam=pose_of_rows(where, "transform_matrix", opencv_rows),
-        read=opened.read,
-        time_ns=round(keys.number("time", Range(0.0)) * 1e9) if "time" in keys else None,
-        mask=opened.mask,
-        notes=opened.notes,
-    )
+    x, z = (-1, 1) if content.get("from_mitsuba") else (1, -1)
+    opencv_rows = [[x * r[0], -r[1], z * r[2], r[3]] for r in rows]
+    pose = pose_of_rows(where, "transform_matrix", opencv_rows)
+    time_ns = round(keys.number("time", Range(0.0)) * 1e9) if "time" in keys else None
+    return posed_picture(where, name, path, camera, pose, time_ns=time_ns, mask=mask)
 
 
 def _camera(where: str, keys: Table, picture: Path) -> SourceCamera:
@@ -174,14 +176,14 @@ def _camera(where: str, keys: Table, picture: Path) -> SourceCamera:
         keys.whole(key) if key in keys else side_px
         for key, side_px in zip(("w", "h"), size_px, strict=True)
     )
-    fx_px = _focal(keys, "fl_x", "camera_angle_x", width_px)
-    has_fy = "fl_y" in keys or "camera_angle_y" in keys
+    fx_px = _focal(keys, "x", width_px)
+    has_fy = any(key in keys for key in ("fl_y", "camera_angle_y", "y_fov"))
     with blamed_on(where):
         intrinsics = Intrinsics(
             width_px=width_px,
             height_px=height_px,
             fx_px=fx_px,
-            fy_px=_focal(keys, "fl_y", "camera_angle_y", height_px) if has_fy else fx_px,
+            fy_px=_focal(keys, "y", height_px) if has_fy else fx_px,
             cx_px=keys.number("cx", default=width_px / 2),
             cy_px=keys.number("cy", default=height_px / 2),
         )
@@ -197,13 +199,15 @@ def _model(keys: Table) -> object:
     return keys.value("camera_model", "OPENCV")
 
 
-def _focal(keys: Table, key: str, angle_key: str, side: int) -> float:
-    """Return a focal length in pixels, stated or as the full field of view in radians."""
-    if key in keys or angle_key not in keys:
-        return keys.number(key)
-    angle_rad = keys.number(angle_key)
+def _focal(keys: Table, axis: str, side: int) -> float:
+    """Return a focal length in pixels, stated or by the full field of view."""
+    focal, angle, degrees = f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov"
+    if focal in keys or (angle not in keys and degrees not in keys):
+        return keys.number(focal)
+    key = angle if angle in keys else degrees
+    angle_rad = keys.number(key) if key == angle else math.radians(keys.number(key))
     if not 0 < angle_rad < math.pi:
-        raise keys.error(angle_key, f"is {angle_rad} rad, outside 0..pi")
+        raise keys.error(key, f"is {angle_rad:g} rad, outside 0..pi")
     return 0.5 * side / math.tan(0.5 * angle_rad)
 
 
@@ -221,7 +225,7 @@ def _applied(where: str, content: Table) -> AppliedTransform | None:
 
 
 def _points(file: Path, content: Table, notes: list[str]) -> SourcePoints | None:
-    if content.value("ply_file_path", None) is None:
+    if "ply_file_path" not in content:
         return None
     name = content.text("ply_file_path")
     path = file_inside(str(file), file.parent, name)
@@ -262,16 +266,7 @@ def _inria_picture(file: Path, index: int, entry: Any) -> SourcePicture:
     rotation = keys.matrix("rotation", ((3, 3),))
     rows = [[*row, t] for row, t in zip(rotation, position, strict=True)]
     path = find_picture(where, file.parent / "images", name)
-    opened = PictureFile.of(path, camera.intrinsics)
-    return SourcePicture(
-        where=where,
-        name=name,
-        camera=camera,
-        world_from_cam=pose_of_rows(where, "rotation", rows),
-        read=opened.read,
-        mask=opened.mask,
-        notes=opened.notes,
-    )
+    return posed_picture(where, name, path, camera, pose_of_rows(where, "rotation", rows))
 
 
 def _inria_camera(where: str, keys: Table) -> SourceCamera:

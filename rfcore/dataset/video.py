@@ -28,8 +28,10 @@ from typing import Any
 
 import av
 import numpy as np
+from av.codec.context import Flags
 from av.container import InputContainer
 from av.error import FFmpegError
+from av.stream import Disposition
 from av.video.codeccontext import VideoCodecContext
 from av.video.stream import VideoStream
 
@@ -54,6 +56,10 @@ CONTAINERS = {
     "mpegvideo": "raw MPEG-2",
     "ivf": "IVF",
     "obu": "raw AV1",
+    "yuv4mpegpipe": "Y4M",
+    "dv": "DV",
+    "nut": "NUT",
+    "gif": "GIF",
 }
 """Containers that are read, by FFmpeg's names. It opens no other: playlists name other files."""
 WHITELIST = ",".join(name for name in av.formats_available if name.split(",")[0] in CONTAINERS)
@@ -72,13 +78,25 @@ def open_video(file: Path) -> InputContainer:
         container = av.open(str(file.absolute()), options={"format_whitelist": WHITELIST})
         if not container.streams.video:
             raise DatasetError(f"{file}: not a readable video (there is none in it)")
-        codec = container.streams.video[0].codec_context
+        codec = shown_stream(container).codec_context
         if isinstance(codec, VideoCodecContext):
             codec.thread_type = "AUTO"
             codec.options = {"max_pixels": str(MAX_PICTURE_PX)}
+            codec.flags |= Flags.unaligned  # else a crop at the left is left out
     except (FFmpegError, OSError, ValueError) as error:
         raise DatasetError(f"{file}: not a readable video ({error})") from error
     return container
+
+
+def shown_stream(container: InputContainer) -> VideoStream:
+    """Return the first video stream that is no cover picture."""
+    return next(
+        (s for s in container.streams.video if not _is_cover(s)), container.streams.video[0]
+    )
+
+
+def _is_cover(stream: VideoStream) -> bool:
+    return Disposition.attached_pic in stream.disposition
 
 
 def is_video(path: Path) -> bool:
@@ -87,19 +105,9 @@ def is_video(path: Path) -> bool:
         return False
     try:
         with open_video(path) as container:
-            return container.streams.video[0].codec_context is not None
+            return shown_stream(container).codec_context is not None
     except DatasetError:
         return False
-
-
-def _whitelist() -> str:
-    names = {
-        part
-        for name in av.formats_available
-        for part in (name,)
-        if name.split(",")[0] in CONTAINERS
-    }
-    return ",".join(sorted(names))
 
 
 @dataclass(frozen=True)
@@ -181,7 +189,7 @@ class Video:
 
     def _start(self) -> None:
         self._container = open_video(self.file)
-        self._stream = self._container.streams.video[0]
+        self._stream = shown_stream(self._container)
         self._frames, self._next = _frames(self._container, self._stream), 0
 
 
@@ -211,7 +219,7 @@ def _index(file: Path) -> VideoIndex:
     keys = [0]
     first: av.VideoFrame | None = None
     with open_video(file) as container:
-        stream = container.streams.video[0]
+        stream = shown_stream(container)
         if stream.codec_context is None:
             raise DatasetError(f"{file}: is of a codec that is not known")
         _check_side(file, stream.codec_context.width, stream.codec_context.height)
@@ -240,12 +248,25 @@ def _index(file: Path) -> VideoIndex:
         if not is_stated:
             rate = _rate_hz(file, stream, len(pts))
             notes.append(f"frames state no times in order: {float(rate):g} a second are taken")
+        notes += _other_streams(container, stream)
         if (cut := _cut(container, times_ns)) is not None:
             notes.append(cut)
     size_px = (first.width, first.height)
     return VideoIndex(
         times_ns, tuple(pts), tuple(keys) if seekable else (0,), size_px, orientation, tuple(notes)
     )
+
+
+def _other_streams(container: InputContainer, read: VideoStream) -> list[str]:
+    """Return a line if there are other videos: a second camera, depth, a smaller copy."""
+    videos = [stream for stream in container.streams.video if not _is_cover(stream)]
+    sizes = [f"{s.width}x{s.height} px" for s in videos if s.index != read.index]
+    if not sizes:
+        return []
+    return [
+        f"the first of {len(sizes) + 1} videos in it, {read.width}x{read.height} px, is read; "
+        f"not read: {', '.join(sizes)}"
+    ]
 
 
 def _check_side(file: Path, width: int, height: int) -> None:

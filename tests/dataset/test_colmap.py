@@ -136,6 +136,29 @@ def test_the_model_with_most_pictures_is_read_and_the_others_are_said(golden, tm
     assert (len(named.pictures), named.changes) == (1, ())
 
 
+@pytest.mark.parametrize("folder", ["images", "input", "images_2"])
+@pytest.mark.parametrize("is_named", [False, True])
+def test_pictures_are_found_in_the_folders_that_people_have(golden, tmp_path, folder, is_named):
+    root = golden.write("colmap_text", tmp_path)
+    (root / "images").rename(root / folder)
+    if is_named:
+        file = root / "sparse" / "0" / "images.txt"
+        file.write_text(re.sub(r" 7 ", f" 7 {folder}/", file.read_text()))
+    dataset = read_dataset(root)
+    assert (dataset.pictures[0].read() == 90).any()
+    said = [] if folder == "images" and not is_named else [f"pictures are taken from {root}"]
+    assert [change[: len(said[0])] for change in dataset.changes] == said
+
+
+def test_the_model_of_distorted_pictures_takes_those_of_input(golden, tmp_path):
+    """INRIA's convert.py leaves ``input``, ``distorted/sparse/0`` and, undistorted, ``images``."""
+    root = golden.write("colmap_text", tmp_path)
+    (root / "images").rename(root / "input")
+    (root / "images").mkdir()
+    shutil.copytree(root / "sparse", root / "distorted" / "sparse")
+    assert (read_dataset(root / "distorted").pictures[0].read() == 90).any()
+
+
 def projected(camera: SourceCamera, rays: np.ndarray) -> np.ndarray:
     k = camera.intrinsics
     sensor = rays if camera.lens is None else camera.lens.distort(rays)

@@ -39,6 +39,18 @@ def test_the_header_says_how_large_a_picture_is(name, options, tmp_path):
     assert picture_header(tmp_path / name).size_px == (77, 31)
 
 
+@pytest.mark.parametrize("shape", [(31, 77, 3), (31, 77)])
+def test_the_first_row_of_a_pfm_is_its_last(shape, tmp_path):
+    """OpenCV writes it; floating point is linear."""
+    light = np.random.default_rng(4).random(shape, np.float32)
+    assert cv2.imwrite(str(tmp_path / "a.pfm"), light)
+    path = picture_paths(tmp_path)[0]
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    expected = np.broadcast_to(srgb[..., None], (*shape, 3)) if len(shape) == 2 else srgb[..., ::-1]
+    seen = read_picture(path, Intrinsics(77, 31, 9, 9, 4, 3))
+    assert np.abs(seen - 255 * expected).max() < 1
+
+
 @pytest.mark.parametrize("suffix", [".bmp", ".tif", ".ppm", ".avif"])
 def test_other_formats_are_decoded_for_their_size_and_known_by_content(suffix, tmp_path):
     path = tmp_path / "a.png"
@@ -61,8 +73,26 @@ def test_a_name_without_suffix_finds_its_picture(tmp_path):
     cv2.imwrite(str(tmp_path / "r_1.5.png"), RGB)
     assert find_picture("x", tmp_path, "./r_0") == tmp_path / "r_0.jpg"
     assert find_picture("x", tmp_path, "r_1.5") == tmp_path / "r_1.5.png"
-    with pytest.raises(DatasetError, match=r"^x: picture .*r_2 is missing"):
-        find_picture("x", tmp_path, "r_2")
+    cv2.imwrite(str(tmp_path) + ".png", RGB)
+    for name in ("r_2", "."):
+        with pytest.raises(DatasetError, match=r"^x: picture .* is missing"):
+            find_picture("x", tmp_path, name)
+
+
+def test_a_name_in_other_upper_and_lower_case_finds_the_only_file_it_can_mean(tmp_path):
+    (tmp_path / "Images").mkdir()
+    cv2.imwrite(str(tmp_path / "Images" / "IMG_1.JPG"), RGB)
+    for name in (
+        "images/img_1.jpg",
+        "Images/IMG_1.jpg",
+        "images/img_1",
+        "/home/x/images/Img_1.jpg",
+    ):
+        assert find_picture("x", tmp_path, name) == tmp_path / "Images" / "IMG_1.JPG"
+    cv2.imwrite(str(tmp_path / "Images" / "img_1.JPG"), RGB)
+    assert find_picture("x", tmp_path, "images/img_1.JPG").name == "img_1.JPG"
+    with pytest.raises(DatasetError, match=r"Img_1\.JPG is missing"):
+        find_picture("x", tmp_path, "Images/Img_1.JPG")
 
 
 @pytest.mark.parametrize("name", ["../a.png", "/etc/passwd", "b/../../a.png", "..\\a.png", "a\0b"])
@@ -211,7 +241,26 @@ def test_a_picture_whose_name_ends_like_a_masks_is_one(tmp_path):
     assert picture_paths(tmp_path) == [tmp_path / "b.png", tmp_path / "iron_mask.png"]
 
 
-def test_a_mask_of_another_size_is_refused(tmp_path):
+@pytest.mark.parametrize("size", [(38, 15), (39, 15), (154, 62), (308, 124)])
+@pytest.mark.parametrize("exif", [1, 6])
+def test_a_mask_of_another_size_is_scaled(size, exif, tmp_path):
+    """By the nearest pixel, as OpenCV's INTER_NEAREST_EXACT takes it."""
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), RGB)
+    white = np.random.default_rng(3).integers(0, 2, size[::-1], np.uint8) * 255
+    cv2.imwrite(str(tmp_path / "masks" / "a.png"), white)
+    shown = (77, 31)
+    if exif == 6:
+        with_exif(tmp_path / "images" / "a.png", 6)
+        white, shown = cv2.rotate(white, cv2.ROTATE_90_CLOCKWISE), (31, 77)
+    opened = PictureFile.of(tmp_path / "images" / "a.png", Intrinsics(*shown, 9, 9, 4, 3))
+    expected = cv2.resize(white, shown, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    assert np.array_equal(opened.mask(), expected)
+    assert "have a mask of another size, which is scaled" in opened.notes[-1]
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path):
     for folder in ("images", "masks"):
         (tmp_path / folder).mkdir()
     cv2.imwrite(str(tmp_path / "images" / "a.png"), RGB)

@@ -12,6 +12,7 @@ from rfcore.camera import TileOrigin
 from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field.ply_table import write_vertices
+from rfcore.image import write_png
 
 Content = dict[str, Any]
 
@@ -229,6 +230,77 @@ def test_a_smaller_size_scales_pictures_and_cameras_alike(write, content):
     assert picture.camera.project((1, 1, -4)) == pytest.approx((3.25, 0, 4))
     with pytest.raises(InvalidInput, match=r"8x6, the size of .*a\.png"):
         read_dataset(write(content), size_px=(16, 12))
+
+
+NULLS = {"k1": None, "fl_y": None, "h": None, "ply_file_path": None, "applied_scale": None}
+
+
+def test_a_key_of_null_is_absent(write, content):
+    plain = read_dataset(write(content))
+    for key in NULLS:
+        content.pop(key, None)
+    without = read_dataset(write(content)).pictures[0].camera
+    content |= NULLS | {"exposure": None, "anchor": None, "camera_model": None, "k4": None}
+    content["frames"][0] |= {"mask_path": None, "time": None, "fl_x": None, "sharpness": None}
+    dataset = read_dataset(write(content))
+    assert (len(dataset.pictures), dataset.points) == (len(plain.pictures), None)
+    assert dataset.pictures[0].camera == without
+    content["frames"][0]["transform_matrix"] = None
+    with pytest.raises(DatasetError, match=r"frames\[0\] .*key 'transform_matrix' is missing"):
+        read_dataset(write(content))
+
+
+@pytest.mark.parametrize("keys", [{"x_fov": 90}, {"camera_angle_x": math.pi / 2, "x_fov": 80}])
+def test_a_field_of_view_may_be_in_degrees(write, content, keys):
+    for key in ("fl_x", "fl_y"):
+        content.pop(key, None)
+    k = read_dataset(write(content | keys)).pictures[0].camera.intrinsics
+    assert (k.fx_px, k.fy_px) == pytest.approx((4, 4))
+    k = read_dataset(write(content | keys | {"y_fov": 90})).pictures[0].camera.intrinsics
+    assert (k.fx_px, k.fy_px) == pytest.approx((4, 3))
+    with pytest.raises(DatasetError, match=r"'x_fov' is 3\.14159 rad, outside"):
+        read_dataset(write(content | {"x_fov": 180}))
+
+
+def test_mitsubas_cameras_look_along_their_z_axis(write, content):
+    """x is left and y up there: the same camera, turned half round y."""
+    plain = read_dataset(write(content)).pictures[1].camera
+    half_round = np.diag([-1.0, 1, -1, 1])
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ half_round).tolist()
+    turned = read_dataset(write(content | {"from_mitsuba": True})).pictures[1].camera
+    assert turned.project((1, 1, -4)) == pytest.approx(plain.project((1, 1, -4)))
+
+
+@pytest.mark.parametrize("scale", [(4, 3), (16, 12), (24, 18)])
+def test_a_camera_is_scaled_to_copies_of_its_pictures(write, content, scale):
+    file = write(content)
+    expected = read_dataset(file).pictures[0].camera.project((1, 1, -4))
+    write_png(file.parent / "a.png", np.full((scale[1], scale[0], 3), 10, np.uint8))
+    dataset = read_dataset(file)
+    u, v, _ = dataset.pictures[0].camera.project((1, 1, -4))
+    assert (u / scale[0], v / scale[1]) == pytest.approx((expected[0] / 8, expected[1] / 6))
+    assert dataset.pictures[0].read().shape == (*scale[::-1], 3)
+    assert dataset.changes == (
+        f"1 of 2 pictures are {scale[0]}x{scale[1]} px: their camera of 8x6 is scaled",
+    )
+
+
+@pytest.mark.parametrize("size", [(4, 2), (8, 7), (6, 8), (9, 6)])
+def test_pictures_of_another_shape_than_their_camera_are_refused(write, content, size):
+    file = write(content)
+    write_png(file.parent / "a.png", np.full((size[1], size[0], 3), 10, np.uint8))
+    with pytest.raises(DatasetError, match=rf"picture is {size[0]}x{size[1]} px, its camera says"):
+        read_dataset(file)
+
+
+def test_names_in_other_upper_and_lower_case_are_found_and_said(write, content):
+    content["frames"][0]["file_path"] = "A.PNG"
+    dataset = read_dataset(write(content))
+    assert (dataset.pictures[0].read() == 10).all()
+    assert dataset.changes == (
+        "1 of 2 pictures are found under names in other upper and lower case",
+    )
 
 
 @pytest.mark.parametrize("missing", [("w", "h"), ("w",), ("h",)])

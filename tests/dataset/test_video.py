@@ -8,6 +8,8 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from av.bitstream import BitStreamFilterContext
+from av.stream import Disposition
 
 from rfcore.camera import Intrinsics
 from rfcore.dataset import read_dataset
@@ -38,6 +40,9 @@ WRITTEN = {
     "a.ivf": ("ivf", "libvpx-vp9"),
     "a.mxf": ("mxf", "mpeg2video"),
     "a.ogv": ("ogg", "libvpx"),
+    "a.y4m": ("yuv4mpegpipe", "rawvideo"),
+    "a.nut": ("nut", "libx264"),
+    "a.gif": ("gif", "gif"),
 }
 """Format and codec by file name."""
 TIMELESS = ("a.avi", "a.h264", "a.hevc", "a.vob")
@@ -59,10 +64,12 @@ def write_video(path: Path, kind: str, codec: str, count: int = COUNT, **options
     with av.open(str(path), "w", format=kind, **options) as container:
         rate = 25 if codec == "mpeg2video" else RATE
         stream = container.add_stream(codec, rate=rate)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.width, stream.height = 64, 48
+        stream.pix_fmt = "gray" if codec == "gif" else "yuv420p"
         stream.options = B_FRAMES if codec == "libx264" else {"g": "10", "b": "2M"}
         for number in range(count):
             frame = av.VideoFrame.from_ndarray(picture(number), "rgb24")
+            frame = frame.reformat(format=stream.pix_fmt)
             frame.pts, frame.time_base = number, Fraction(1, rate)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
@@ -109,6 +116,80 @@ def test_each_container_gives_the_times_of_its_frames(videos, name):
     np.testing.assert_allclose(np.array(video.index.times_ns) / 1e9, expected, atol=6e-4)
     said = [note for note in video.index.notes if "a second are taken" in note]
     assert bool(said) == (name in TIMELESS)
+
+
+def test_dv_gives_the_frame_that_is_asked_for(tmp_path):
+    path = tmp_path / "a.dv"
+    with av.open(str(path), "w", format="dv") as container:
+        stream = container.add_stream("dvvideo", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 720, 576, "yuv420p"
+        for number in range(8):
+            frame = av.VideoFrame.from_ndarray(picture(number, 720, 576), "rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, 25)
+            container.mux(stream.encode(frame.reformat(format="yuv420p")))
+        container.mux(stream.encode(None))
+    video = Video(path)
+    assert video.index.times_ns == tuple(40_000_000 * number for number in range(8))
+    for number in (5, 7, 3, 4, 0):
+        assert (video.read(number)[200:500, 50:300].mean() - 40) / 6 == pytest.approx(
+            number, abs=0.3
+        )
+
+
+@pytest.mark.parametrize(("kind", "codec"), [("h264", "libx264"), ("hevc", "libx265")])
+@pytest.mark.parametrize(("left", "top", "right"), [(0, 0, 6), (2, 4, 0), (6, 2, 8), (32, 16, 0)])
+def test_a_cropped_video_shows_what_its_parameters_leave(tmp_path, kind, codec, left, top, right):
+    whole = write_video(tmp_path / "a.mp4", "mp4", codec, 5)
+    with av.open(str(whole)) as source, av.open(str(tmp_path / "b.mp4"), "w") as container:
+        stream = source.streams.video[0]
+        copy = container.add_stream_from_template(stream)
+        crop = f"{kind}_metadata=crop_left={left}:crop_top={top}:crop_right={right}"
+        changed = BitStreamFilterContext(crop, stream, copy)
+        for packet in source.demux(stream):
+            for out in changed.filter(packet if packet.dts is not None else None):
+                out.stream = copy
+                container.mux(out)
+    video = Video(tmp_path / "b.mp4")
+    assert video.size_px == (64 - left - right, 48 - top)
+    assert np.array_equal(video.read(3), Video(whole).read(3)[top:, left : 64 - right])
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.ts"])
+def test_of_several_videos_the_first_is_read_and_the_others_are_said(tmp_path, name):
+    """Dash cams have the rear camera in the same file."""
+    with av.open(str(tmp_path / name), "w") as container:
+        streams = [container.add_stream("libx264", rate=RATE) for _ in range(2)]
+        for stream, (width, height) in zip(streams, ((64, 48), (32, 24)), strict=True):
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for number in range(3):
+            for stream in streams:
+                rgb = picture(number, stream.width, stream.height)
+                frame = av.VideoFrame.from_ndarray(rgb, "rgb24")
+                frame.pts, frame.time_base = number, Fraction(1, RATE)
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    video = Video(tmp_path / name)
+    assert (len(video.index.pts), video.size_px) == (3, (64, 48))
+    assert "the first of 2 videos in it, 64x48 px, is read; not read: 32x24 px" in video.index.notes
+
+
+def test_a_cover_picture_is_no_video(tmp_path):
+    """It comes first where a program has put it there."""
+    plain = write_video(tmp_path / "a.mp4", "mp4", "libx264", 5)
+    with av.open(str(plain)) as source, av.open(str(tmp_path / "b.mp4"), "w") as container:
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = 32, 32, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        copy = container.add_stream_from_template(source.streams.video[0])
+        still = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8), "rgb24")
+        container.mux([*cover.encode(still), *cover.encode(None)])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = copy
+                container.mux(packet)
+    video = Video(tmp_path / "b.mp4")
+    assert (len(video.index.pts), video.size_px, video.index.notes) == (5, (64, 48), ())
 
 
 def test_an_avi_of_copied_packets_has_the_rate_of_its_length(videos, tmp_path):
