@@ -42,7 +42,8 @@ from rfcore.dataset.keys import (
     table_at,
     text_lines,
 )
-from rfcore.dataset.picture_file import file_inside, find_picture, posed_picture
+from rfcore.dataset.picture_file import posed_picture
+from rfcore.dataset.picture_name import file_inside, find_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
 from rfcore.errors import DatasetError
 from rfcore.lens import FisheyeLens

@@ -24,7 +24,8 @@ from rfcore.dataset.arrow_file import arrow_metadata, arrow_rows, opened_arrow
 from rfcore.dataset.bag_transforms import Edge
 from rfcore.dataset.drive_set import US, Shot, pinhole_of_matrix, posed_source
 from rfcore.dataset.keys import lens_of, pose_of_quaternion, table_at
-from rfcore.dataset.picture_file import file_inside, is_whole_jpeg, require_size
+from rfcore.dataset.picture_file import is_whole_jpeg, require_size
+from rfcore.dataset.picture_name import file_inside
 from rfcore.dataset.source import Source, SourceCamera
 from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError

@@ -20,7 +20,7 @@ from rfcore.camera import Pose
 from rfcore.dataset.bag_transforms import Edge
 from rfcore.dataset.drive_set import US, Shot, pinhole_of_matrix, posed_source
 from rfcore.dataset.keys import pose_of_quaternion, table_at
-from rfcore.dataset.picture_file import file_inside
+from rfcore.dataset.picture_name import file_inside
 from rfcore.dataset.source import Source
 from rfcore.errors import DatasetError, named
 from rfcore.tables import Table

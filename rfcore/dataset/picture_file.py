@@ -1,26 +1,24 @@
-"""Picture files of a dataset: where they are, how large, and which of their pixels count.
+"""Picture files of a dataset: how large they are, and which of their pixels count.
 
 A picture is read as it is stored or, where only that fits its camera, turned as its EXIF
 orientation says: COLMAP, instant-ngp and nerfstudio know nothing of EXIF. Where pictures are copies
-of another size (``images_4``), the camera is scaled to them. A name that differs from its file's in
-upper and lower case alone finds it. A picture's mask is the file that
+of another size (``images_4``), the camera is scaled to them. A picture's mask is the file that
 the dataset names, or one beside the pictures: ``masks/NAME.png``, ``masks/STEM.png`` or
 ``masks/STEM_mask.png`` next to the folder ``images`` (COLMAP, gsplat, LichtFeld Studio, Metashape),
 ``NAME.mask.png``, ``STEM.mask.png`` or ``STEM_mask.png`` in the picture's folder (RealityScan,
 OpenDroneMap), or instant-ngp's ``dynamic_mask_STEM.png``.
 A mask of another size and the same shape is scaled. White is learnt and measured, black is not, but
-for instant-ngp's masks, which are white where
-something moves. A transparent pixel is not learnt either.
+for instant-ngp's masks, which are white where something moves. A transparent pixel is not learnt
+either.
 """
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import product, takewhile
-from pathlib import Path, PurePosixPath
-from posixpath import normpath
+from itertools import product
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -34,115 +32,20 @@ from rfcore.dataset.picture_header import (
     jpeg_segments,
     picture_format,
     picture_header,
+    remedy,
 )
+from rfcore.dataset.picture_name import SUFFIXES, differs_in_case
 from rfcore.dataset.source import SourceCamera, SourcePicture
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, read_frame, read_pixels
 from rfcore.pixels import Pixels, pixels_of
-from rfcore.tables import shortened
 from rfcore.views import Mask
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG", ".WEBP")
-"""Suffixes that a name without one may stand for."""
 MASK_FOLDERS, MASK_SUFFIXES = ("masks", "mask", "Masks"), (*SUFFIXES, ".tif", ".tiff")
-MAX_PART_BYTES = 255
-"""Longest file name of Linux file systems."""
 LEAST_SCALE = 1.1
 """Sizes that are closer to each other are of a picture that was cropped, not scaled."""
 JPEG_SCAN = 0xDA
 JPEG_END = b"\xff\xd9"
-
-
-def inside(where: str, folder: Path, name: str) -> Path:
-    """Return ``folder / name``, where ``name`` may be written for Windows, or absolute.
-
-    An absolute name is of a file in the folder, or in another machine's copy of it: the longest end
-    of it that is there is taken. Raises ``DatasetError`` for a name that leaves the folder.
-    """
-    path = _inside(where, folder, name)
-    if path is None:
-        raise DatasetError(
-            f"{where}: path '{name}' leaves the dataset's folder {folder}, and no end of it is "
-            "there; name files relative to that folder"
-        )
-    return path
-
-
-def _inside(where: str, folder: Path, name: str) -> Path | None:
-    """Return the same, None for an absolute name of which no end is in the folder."""
-    path = PurePosixPath(name.replace("\\", "/"))
-    if any(len(part.encode()) > MAX_PART_BYTES for part in path.parts):
-        raise DatasetError(f"{where}: path {shortened(name)} is too long")
-    path = PurePosixPath(normpath(path))
-    if ".." in path.parts or "\0" in name:
-        raise DatasetError(
-            f"{where}: path '{name}' leaves the dataset's folder {folder}; put the file that names "
-            "it into a folder above all pictures"
-        )
-    if not is_absolute(name):
-        return folder / path
-    ends = (folder.joinpath(*path.parts[i:]) for i in range(1, len(path.parts)))
-    return next((end for end in ends if end.exists() or _existing(end) is not None), None)
-
-
-def is_absolute(name: str) -> bool:
-    """Tell whether a name is absolute on Linux or Windows."""
-    return name[:1] in ("/", "\\") or name[1:3] in (":/", ":\\")
-
-
-def find_picture(where: str, folder: Path, name: str) -> Path:
-    """Return the file of a picture; raise ``DatasetError`` if it is missing."""
-    path = file_inside(where, folder, name)
-    if path is None:
-        raise DatasetError(f"{where}: picture {inside(where, folder, name)} is missing")
-    return path
-
-
-def file_inside(where: str, folder: Path, name: str) -> Path | None:
-    """Return the file or ``None``; a name without suffix may mean any of PNG, JPEG, WebP."""
-    path = _inside(where, folder, name)
-    return None if path is None or path == folder else _existing(path)
-
-
-def _existing(path: Path) -> Path | None:
-    suffixes = ("",) if path.suffix in SUFFIXES else ("", *SUFFIXES)
-    named = [path.with_name(path.name + suffix) for suffix in suffixes]
-    found = next((candidate for candidate in named if candidate.is_file()), None)
-    if found is not None:
-        return found
-    others = {other for name in named if (other := _in_other_case(name)) and other.is_file()}
-    return others.pop() if len(others) == 1 else None
-
-
-def _in_other_case(path: Path) -> Path | None:
-    """Return what is called so but for upper and lower case, ``None`` unless just one is."""
-    if path.exists():
-        return path
-    if path.parent == path or (folder := _in_other_case(path.parent)) is None:
-        return None
-    if not folder.is_dir() or (folder / path.name).exists():
-        return folder / path.name
-    names = _names_by_case(folder, folder.stat().st_mtime_ns).get(path.name.casefold(), [])
-    return folder / names[0] if len(names) == 1 else None
-
-
-@lru_cache(maxsize=16)
-def _names_by_case(folder: Path, _: int) -> dict[str, list[str]]:
-    """Return a folder's names by what they are in lower case, as of its time of change."""
-    names: dict[str, list[str]] = {}
-    for path in folder.iterdir():
-        names.setdefault(path.name.casefold(), []).append(path.name)
-    return names
-
-
-def _differs_in_case(path: Path, name: str) -> bool:
-    """Return whether the file that was found for a name has other letters in its path."""
-    asked = PurePosixPath(normpath(name.replace("\\", "/"))).parts[::-1]
-    pairs = list(zip(asked, path.parts[::-1], strict=False))
-    if not pairs[0][1].startswith(pairs[0][0]):
-        return True
-    same = takewhile(lambda pair: pair[0].casefold() == pair[1].casefold(), pairs[1:])
-    return any(a != b for a, b in same)
 
 
 def posed_picture(
@@ -169,7 +72,7 @@ def posed_picture(
         read=opened.read,
         time_ns=time_ns,
         mask=opened.mask,
-        notes=opened.notes + (renamed if _differs_in_case(path, name) else ()),
+        notes=opened.notes + (renamed if differs_in_case(path, name) else ()),
     )
 
 
@@ -362,9 +265,10 @@ def picture_paths(folder: Path) -> list[Path]:
         raise DatasetError(f"{folder}: holds no pictures (PNG, JPEG, WebP, TIFF, OpenEXR, ...)")
     unread = [path for path in paths if formats[path] in UNREAD]
     if unread:
+        found, pattern = str(formats[unread[0]]), f"{shlex.quote(str(folder))}/*{unread[0].suffix}"
         raise DatasetError(
-            f"{folder}: {len(unread)} of {len(paths)} pictures are {formats[unread[0]]}, which is "
-            "not read; export them as JPEG or PNG"
+            f"{folder}: {len(unread)} of {len(paths)} pictures are {found}, which is not read; "
+            f"{remedy(found, pattern)}"
         )
     return paths
 

@@ -7,6 +7,7 @@ allocating it, and a wrong size is found before a long run starts.
 
 from __future__ import annotations
 
+import shlex
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -40,6 +41,10 @@ SIGNATURES = {
     b"Pf": "PFM",
 }
 UNREAD = ("JPEG XL", "HEIC")
+HEIC_TO_PNG = (
+    "import sys, pillow_heif as h; "
+    '[h.open_heif(f).to_pillow().save(f + ".png") for f in sys.argv[1:]]'
+)
 HEIC = (b"heic", b"heix", b"heim", b"heis", b"mif1")
 START_BYTES = 32
 EXIF_START, ICC_START = b"Exif\0\0", b"ICC_PROFILE\0"
@@ -84,11 +89,18 @@ def picture_format(path: Path) -> str | None:
     return next((name for sign, name in SIGNATURES.items() if start.startswith(sign)), None)
 
 
+def remedy(unread: str, files: str) -> str:
+    """Return what to do with pictures of a format that is not read; ``files`` are quoted."""
+    if unread == "HEIC":
+        return f"convert: pip install pillow-heif && python -c '{HEIC_TO_PNG}' {files}"
+    return "export as JPEG or PNG"
+
+
 def picture_header(path: Path) -> PictureHeader:
     """Return what the file says; raise ``DatasetError`` naming it for one that is no picture."""
     found = picture_format(path)
     if found in UNREAD:
-        raise DatasetError(f"{path}: {found} is not read; export the picture as JPEG or PNG")
+        raise DatasetError(f"{path}: {found} is not read; {remedy(found, shlex.quote(str(path)))}")
     try:
         with path.open("rb") as file:
             header = {"PNG": _png, "JPEG": _jpeg, "WebP": _webp}.get(found or "", _none)(file)

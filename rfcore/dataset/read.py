@@ -58,14 +58,9 @@ from rfcore.dataset.keys import (
     table_at,
 )
 from rfcore.dataset.kitti import OXTS, read_kitti_raw_source, read_kitti_source
-from rfcore.dataset.picture_file import (
-    MaskFile,
-    file_inside,
-    find_picture,
-    is_absolute,
-    posed_picture,
-)
+from rfcore.dataset.picture_file import MaskFile, posed_picture
 from rfcore.dataset.picture_header import picture_format, picture_header
+from rfcore.dataset.picture_name import file_inside, find_picture, is_absolute
 from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
 from rfcore.dataset.recording import read_recording_source
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points

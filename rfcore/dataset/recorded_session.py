@@ -25,7 +25,8 @@ from typing import Any
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import blamed_on, read_file, table_at
-from rfcore.dataset.picture_file import PictureFile, find_picture
+from rfcore.dataset.picture_file import PictureFile
+from rfcore.dataset.picture_name import find_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture
 from rfcore.errors import DatasetError
 from rfcore.tables import Range, Table

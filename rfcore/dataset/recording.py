@@ -59,7 +59,8 @@ from rfcore.dataset.keys import (
     pose_of_rows,
     table_at,
 )
-from rfcore.dataset.picture_file import PictureFile, inside, picture_paths
+from rfcore.dataset.picture_file import PictureFile, picture_paths
+from rfcore.dataset.picture_name import inside
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
 from rfcore.dataset.video import Video

@@ -35,7 +35,7 @@ from pathlib import Path
 
 from rfcore.camera import Pose, TileOrigin, camera_on_rig
 from rfcore.dataset.keys import POSE_SHAPES, load_toml, pose_of_rows, table_at
-from rfcore.dataset.picture_file import inside
+from rfcore.dataset.picture_name import inside
 from rfcore.dataset.read import read_dataset
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.files import write_whole

@@ -7,6 +7,7 @@ tells formats by their suffixes. So are a ``.gltf`` and other JSON here.
 from __future__ import annotations
 
 import shlex
+import zlib
 from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO
@@ -21,10 +22,12 @@ from rfcore.field.stored_splats import ImportedSplats, settled
 from rfcore.files import DECODED_BYTES
 
 SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".gltf")
-START_BYTES = 64
-"""Bytes of a file that tell its format."""
+START_BYTES = 1024
+"""Bytes of a file that tell its format; what gzip packed begins behind its name."""
 CONVERTED = (".splat", ".ksplat", ".sog", ".lcc", ".lcc2", "meta.json")
 """Ends of the names of files that splat-transform reads."""
+LEVELS = (".lcc", ".lcc2")
+"""Suffixes of formats with levels of detail, which splat-transform puts one over the other."""
 SOG_PICTURES = (b".webp", b"meta.json")
 ZIP_MAGIC, ZIP_NAME_AT = b"PK\x03\x04", 30
 
@@ -51,11 +54,24 @@ def splat_format(path: Path, start: bytes) -> SplatFormat:
     """
     if start.startswith(b"ply"):
         return SplatFormat.PLY
+    if _is_packed_ply(start):
+        plain = path.with_suffix("") if path.stem.lower().endswith(".ply") else f"{path}.ply"
+        source, target = shlex.quote(str(path)), shlex.quote(str(plain))
+        raise FieldFormatError(
+            f"{path}: is a .ply that gzip packed; unpack it: gunzip -c {source} > {target}"
+        )
     if start.startswith((GZIP_MAGIC, MAGIC.to_bytes(4, "little"))):
         return SplatFormat.SPZ
     if start.startswith(GLTF_MAGIC) or (is_json(start) and path.suffix.lower() == ".gltf"):
         return SplatFormat.GLTF
     raise FieldFormatError(f"{path}: {_what_else(path, start)}")
+
+
+def _is_packed_ply(start: bytes) -> bool:
+    try:
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, 3) == b"ply"
+    except zlib.error:
+        return False
 
 
 def is_json(start: bytes) -> bool:
@@ -94,8 +110,12 @@ def _converted(what: str, path: Path, wanted_suffix: str = "") -> str:
     named = path.with_suffix(wanted_suffix) if wanted_suffix else path
     source, target = shlex.quote(str(named)), shlex.quote(str(path.with_suffix(".ply")))
     copied = f"cp {shlex.quote(str(path))} {source} && " if wanted_suffix else ""
-    command = f"{copied}npx @playcanvas/splat-transform {source} {target}"
-    return f"is {what}, which is not read; convert it (with Node.js): {command}"
+    how, program = "(with Node.js)", "@playcanvas/splat-transform"
+    if path.suffix.lower() in LEVELS:
+        how = "(with Node.js; its finest level) and import it with --up -y"
+        program += "@3 --select-lod 0"
+    command = f"{copied}npx {program} {source} {target}"
+    return f"is {what}, which is not read; convert it {how}: {command}"
 
 
 def read_splat_file(

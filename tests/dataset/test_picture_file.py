@@ -1,5 +1,8 @@
 """The size of a picture is read from its header, and no name leaves the dataset's folder."""
 
+import os
+import subprocess
+import venv
 import zlib
 
 import cv2
@@ -10,14 +13,9 @@ from PIL import Image
 from docs.pages import ROOT
 from rfcore.camera import Intrinsics
 from rfcore.dataset.colour_profile import OTHER_PROFILE, profile_of
-from rfcore.dataset.picture_file import (
-    PictureFile,
-    find_picture,
-    inside,
-    picture_paths,
-    read_picture,
-)
+from rfcore.dataset.picture_file import PictureFile, picture_paths, read_picture
 from rfcore.dataset.picture_header import SIGNATURES, UNREAD, picture_header
+from rfcore.dataset.picture_name import find_picture, inside
 from rfcore.dataset.video import CONTAINERS
 from rfcore.errors import DatasetError
 
@@ -182,11 +180,55 @@ def test_exif_turns_a_picture_where_its_camera_is_of_the_turned_one(name, number
     assert turned.notes[0].startswith("are ")
 
 
-@pytest.mark.parametrize("content", [b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", b"\xff\x0a\0\0"])
-def test_formats_that_are_not_read_are_named_with_what_to_do(content, tmp_path):
+@pytest.mark.parametrize(
+    ("content", "todo"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "convert: pip install pillow-heif && python -c"),
+        (b"\xff\x0a\0\0", "export as JPEG or PNG"),
+    ],
+)
+def test_formats_that_are_not_read_are_named_with_what_to_do(content, todo, tmp_path):
     (tmp_path / "IMG_1.HEIC").write_bytes(content)
-    with pytest.raises(DatasetError, match="not read; export them as JPEG or PNG"):
-        picture_paths(tmp_path)
+    for read in (picture_paths, lambda folder: picture_header(folder / "IMG_1.HEIC")):
+        with pytest.raises(DatasetError, match=f"is not read; {todo}") as refused:
+            read(tmp_path)
+        assert "\n" not in str(refused.value)
+
+
+MADE_HEIC = """
+import sys, pillow_heif
+from PIL import Image, ImageCms
+pillow_heif.register_heif_opener()
+image = Image.new("RGB", (64, 48), (200, 40, 40))
+image.paste((40, 200, 40), (0, 24, 32, 48))
+exif = Image.Exif()
+exif[0x0112] = 6
+profile = open(sys.argv[2], "rb").read()
+image.save(sys.argv[1], quality=100, exif=exif.tobytes(), icc_profile=profile)
+"""
+
+
+@pytest.mark.slow
+def test_the_command_for_heic_leads_to_pictures(tmp_path):
+    """Turned by its orientation, with its colour profile: as phones write it."""
+    scene, tools = tmp_path / "a b", tmp_path / "tools"
+    scene.mkdir()
+    venv.create(tools, with_pip=True)
+    install = [tools / "bin" / "pip", "install", "-q", "pillow-heif"]
+    if subprocess.run(install, check=False).returncode:
+        pytest.skip("needs the package index")
+    (tmp_path / "p3.icc").write_bytes(icc(GAMUTS["Display P3"], "Display P3"))
+    words = [tools / "bin" / "python", "-c", MADE_HEIC, scene / "IMG_1.HEIC", tmp_path / "p3.icc"]
+    subprocess.run(words, check=True)
+    with pytest.raises(DatasetError) as refused:
+        picture_paths(scene)
+    command = str(refused.value).partition("convert: ")[2]
+    path = f"{tools / 'bin'}:{os.environ['PATH']}"
+    subprocess.run(command, shell=True, check=True, env=os.environ | {"PATH": path})
+    opened = PictureFile.of(scene / "IMG_1.HEIC.png", Intrinsics(48, 64, 9, 9, 4, 3))
+    assert opened.notes == ("are in Display P3 and become sRGB",)
+    assert opened.read()[5, 5].argmax() == 1
+    assert opened.read()[5, 40].argmax() == 0
 
 
 MASKED = np.zeros((31, 77), bool)

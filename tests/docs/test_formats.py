@@ -287,6 +287,13 @@ SPLATS = [
         "npx @playcanvas/splat-transform",
     ),
     Row(
+        ".ply.gz",
+        "any",
+        "refused, with the command that unpacks it",
+        content(lambda folder: gzip.compress(layout(INRIA)(folder).read_bytes()), "a.ply.gz"),
+        "gunzip -c",
+    ),
+    Row(
         ".zip",
         "any",
         "refused, with the command that unpacks it",
