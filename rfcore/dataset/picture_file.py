@@ -253,7 +253,8 @@ def _is_mask(path: Path, names: Container[str]) -> bool:
 def picture_paths(folder: Path) -> list[Path]:
     """Return the pictures of a folder, told by their content, in the order of their names.
 
-    Raises ``DatasetError`` for formats that are not read, and without any.
+    Raises ``DatasetError`` for formats that are not read, but where ``NAME.png`` is the converted
+    copy, and without any.
     """
     if folder.is_file():
         raise DatasetError(f"{folder}: is neither a folder of pictures nor a video that is read")
@@ -263,6 +264,7 @@ def picture_paths(folder: Path) -> list[Path]:
     paths = [path for path in files if formats[path] and not _is_mask(path, names)]
     if not paths:
         raise DatasetError(f"{folder}: holds no pictures (PNG, JPEG, WebP, TIFF, OpenEXR, ...)")
+    paths = [p for p in paths if formats[p] not in UNREAD or f"{p.name}.png" not in names]
     unread = [path for path in paths if formats[path] in UNREAD]
     if unread:
         found, pattern = str(formats[unread[0]]), f"{shlex.quote(str(folder))}/*{unread[0].suffix}"

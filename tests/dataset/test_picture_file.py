@@ -193,6 +193,8 @@ def test_formats_that_are_not_read_are_named_with_what_to_do(content, todo, tmp_
         with pytest.raises(DatasetError, match=f"is not read; {todo}") as refused:
             read(tmp_path)
         assert "\n" not in str(refused.value)
+    cv2.imwrite(str(tmp_path / "IMG_1.HEIC.png"), RGB)
+    assert picture_paths(tmp_path) == [tmp_path / "IMG_1.HEIC.png"]
 
 
 MADE_HEIC = """
@@ -225,6 +227,7 @@ def test_the_command_for_heic_leads_to_pictures(tmp_path):
     command = str(refused.value).partition("convert: ")[2]
     path = f"{tools / 'bin'}:{os.environ['PATH']}"
     subprocess.run(command, shell=True, check=True, env=os.environ | {"PATH": path})
+    assert picture_paths(scene) == [scene / "IMG_1.HEIC.png"], "the command leads on"
     opened = PictureFile.of(scene / "IMG_1.HEIC.png", Intrinsics(48, 64, 9, 9, 4, 3))
     assert opened.notes == ("are in Display P3 and become sRGB",)
     assert opened.read()[5, 5].argmax() == 1

@@ -36,6 +36,8 @@ def test_other_formats_become_png_and_the_rest_stays_as_it_is(name, kept, tmp_pa
 def test_heic_is_named_with_what_to_do(tmp_path):
     (tmp_path / "shots").mkdir()
     (tmp_path / "shots" / "IMG_1.jpg").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
-    with pytest.raises(DatasetError, match="1 of 1 pictures are HEIC, which is not read; export"):
+    with pytest.raises(
+        DatasetError, match="1 of 1 pictures are HEIC, which is not read; convert: pip"
+    ):
         pose_dataset(tmp_path / "shots", tmp_path / "out", None, PoseSettings(), print)
     assert not (tmp_path / "out").exists()
