@@ -66,14 +66,14 @@ test-slow: build-full test-system-packages  ## tests that take more than ten sec
 # OpenH264 for tests/codec/test_second_decoder.py, GStreamer's RTSP server for tests/agent/live,
 # Chromium for tests/twin, bwrap for tests/server and tests/confinement, libseccomp for
 # tests/confinement, nft for tests/fault, PoCL (OpenCL on the CPU) for tests/raster, NATS for
-# tests/integration/test_nats.py. A test fails without its program, and says so. With LLVM, tests of
+# tests/integration/test_nats.py, gpsd for tests/agent/pose_feed. A test fails without its program, and says so. With LLVM, tests of
 # the street render in a quarter of the time.
 SYSTEM_PACKAGES := g++-aarch64-linux-gnu qemu-user prometheus iproute2 \
 	gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-bad \
 	gstreamer1.0-plugins-ugly gir1.2-gst-rtsp-server-1.0 python3-gi bubblewrap libseccomp2 nftables \
-	chromium chromium-driver pocl-opencl-icd nats-server libllvm19
+	chromium chromium-driver pocl-opencl-icd nats-server libllvm19 gpsd
 SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc gst-inspect-1.0 \
-	bwrap nft chromium chromedriver nats-server
+	bwrap nft chromium chromedriver nats-server /usr/sbin/gpsd
 test-system-packages:  ## install the programs that test-slow uses (root, Debian)
 	@if (for name in $(SYSTEM_PROGRAMS); do command -v $$name >/dev/null || exit 1; done) && \
 		[ -e /etc/OpenCL/vendors/pocl.icd ] && ldconfig -p | grep -q 'libLLVM.*19'; then :; \

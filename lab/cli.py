@@ -26,6 +26,7 @@ from lab.robust import EvalRobust
 from lab.servers import EvalScale
 from lab.size_tables import EvalSizing
 from lab.tcp import EvalTcp
+from lab.truth import EvalLiveTruth
 from lab.world import EvalWorld
 from rfcore.program import parse_options, run_program
 
@@ -42,6 +43,7 @@ Verb = (
     | Annotated[EvalIntraSize, subcommand("intra-size")]
     | Annotated[EvalLatency, subcommand("latency")]
     | Annotated[EvalLive, subcommand("live")]
+    | Annotated[EvalLiveTruth, subcommand("live-truth")]
     | Annotated[EvalLocalise, subcommand("localise")]
     | Annotated[EvalPaper, subcommand("paper")]
     | Annotated[EvalRig, subcommand("rig")]

@@ -18,7 +18,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse lossy-link robust ladder latency head compare compare-small)
 	cp $^ lab/results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder compare-size robust-long localise benchmark $(if $(DATA),detect) rig live cold-start world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder compare-size robust-long localise benchmark $(if $(DATA),detect) rig live live-truth cold-start world paper)
 	cp $(filter %.json,$^) lab/results/
 	$(MAKE) -f lab/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -196,6 +196,9 @@ $(OUT)/never-worse.json: | $(OUT)
 	$(RFEDGE) eval never-worse $(SAMPLE) $(NOON) --decimated $(NOON) --cells $(OUT)/never-worse --out $@
 $(OUT)/lossy-link.json: | $(OUT)
 	$(RFEDGE) eval lossy-link --rates-mbps 0.5 2 8 --losses 0 1 2 5 --seeds 5 --cells $(OUT)/lossy-link --out $@
+# With GStreamer and gpsd (`make test-system-packages`), and beside the revision before its faults were ended.
+$(OUT)/live-truth.json: | $(OUT)
+	$(LAB) live-truth --before 5e03a6d4 $(if $(DATA),--comma $(DATA)/comma2k19) --out $@
 $(OUT)/tcp.json: | $(OUT)  # as root: network namespaces
 	$(LAB) tcp --out $@
 # Ten pictures a second do not tell apart round trips that are shorter than 100 ms.

@@ -34,13 +34,16 @@ from av.video.codeccontext import VideoCodecContext
 
 from cav_agent.live.settings import ReaderSettings, SourceAddress, SourceKind
 from cav_agent.live.unbroken import UnbrokenPictures
-from rfcore.errors import RfedgeError
+from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import Rgb, rgb_from_video_frame
 
 NS = 1_000_000_000
 PRODUCER_TIME = struct.Struct("<q")
 """``AVProducerReferenceTime.wallclock``, microseconds of the Unix epoch: from sender reports."""
 KEPT_TIMES = 64
+INTERLACED = (
+    "each picture is two fields of two instants (interlaced); set the camera to progressive"
+)
 EARLY_SHARE = 0.3
 """Share of a period by which a frame may be too early and is still taken, since cameras jitter."""
 
@@ -194,6 +197,8 @@ def main() -> None:
     Thread(target=_decode, args=(settings, newest), daemon=True).start()
     while isinstance(taken := newest.take(), Decoded):
         try:
+            if taken.frame.interlaced_frame:
+                raise InvalidInput("source", INTERLACED)
             rgb = rgb_from_video_frame(taken.frame, "the source")
         except RfedgeError as error:
             taken = EndRecord(str(error))
@@ -274,6 +279,8 @@ def _frames(settings: ReaderSettings) -> Iterator[Decoded | None]:
     # flag a picture that lacks slices.
     context.thread_count = 1
     context.flags |= av.codec.context.Flags.low_delay
+    # A crop on the left is kept as the stream says, not rounded to what is fast to read.
+    context.flags |= av.codec.context.Flags.unaligned
     unbroken = _unbroken(address, context)
     period_ns = PeriodOfParser(address, context)
     sent: dict[int, int] = {}

@@ -11,8 +11,9 @@ about velocity * tau; a bias adds the same everywhere. Over fixes with errors e 
 
     e = bias + v tau + noise,
 
-the least-squares tau is sum (v - mean v)(e - mean e) / sum |v - mean v|^2. It is known as far as
-the velocity has changed, in size or direction. Old fixes are forgotten.
+the least-squares tau is sum w (v - mean v)(e - mean e) / sum w (v - mean v)^2, along each axis with
+the weights w of its variances: a height that is unknown says nothing. It is known as far as the
+velocity has changed, in size or direction. Old fixes are forgotten.
 """
 
 from __future__ import annotations
@@ -62,8 +63,9 @@ class TimeOffsetEstimator:
 
     def __init__(self) -> None:
         self._path: deque[tuple[float, Vec3]] = deque(maxlen=KEPT)
-        self._pairs: deque[tuple[Vec3, Vec3]] = deque(maxlen=KEPT)
-        self._waiting: deque[tuple[float, Vec3]] = deque(maxlen=KEPT)
+        self._pairs: deque[tuple[Vec3, Vec3, Vec3]] = deque(maxlen=KEPT)
+        """Errors, velocities and standard deviations."""
+        self._waiting: deque[tuple[float, Vec3, Vec3]] = deque(maxlen=KEPT)
 
     def localised(self, time_s: float, position_m: Vec3) -> None:
         """Take a position the field gave; raise ``InvalidInput`` for time that goes back."""
@@ -73,26 +75,29 @@ class TimeOffsetEstimator:
         while self._waiting and self._waiting[0][0] <= time_s:
             self._compare(*self._waiting.popleft())
 
-    def measured(self, time_s: float, position_m: Vec3) -> None:
+    def measured(self, time_s: float, position_m: Vec3, std_m: Vec3) -> None:
         """Take a position the feed gave, compared as soon as the path has come so far."""
-        self._waiting.append((time_s, position_m))
+        self._waiting.append((time_s, position_m, std_m))
 
     def offset(self) -> TimeOffset | None:
         """Return the offset, None while the drive does not determine it to 0.1 s."""
         if len(self._pairs) < FEWEST:
             return None
         pairs = np.array(self._pairs)
-        errors, velocities = pairs[:, 0], pairs[:, 1]
-        errors, velocities = errors - errors.mean(axis=0), velocities - velocities.mean(axis=0)
-        change = float((velocities**2).sum())
+        weights = pairs[:, 2] ** -2
+        errors, velocities = (
+            values - np.average(values, axis=0, weights=weights)
+            for values in (pairs[:, 0], pairs[:, 1])
+        )
+        change = float((weights * velocities**2).sum())
         if change <= 0.0:
             return None
-        seconds = float((velocities * errors).sum()) / change
-        noise = float(((errors - seconds * velocities) ** 2).sum())
+        seconds = float((weights * velocities * errors).sum()) / change
+        noise = float((weights * (errors - seconds * velocities) ** 2).sum())
         std_s = math.sqrt(noise / (3 * len(pairs) - 4) / change)
         return TimeOffset(seconds, std_s) if std_s <= DETERMINED_S else None
 
-    def _compare(self, time_s: float, position_m: Vec3) -> None:
+    def _compare(self, time_s: float, position_m: Vec3, std_m: Vec3) -> None:
         times = [at_s for at_s, _ in self._path]
         after = bisect_right(times, time_s)
         after = after - 1 if after == len(times) and times[-1] == time_s else after
@@ -103,7 +108,7 @@ class TimeOffsetEstimator:
         velocity = [(q - p) / (end_s - begin_s) for p, q in zip(a, b, strict=True)]
         error = [z - p - share * (q - p) for z, p, q in zip(position_m, a, b, strict=True)]
         self._pairs.append(
-            ((error[0], error[1], error[2]), (velocity[0], velocity[1], velocity[2]))
+            ((error[0], error[1], error[2]), (velocity[0], velocity[1], velocity[2]), std_m)
         )
 
 
@@ -231,7 +236,7 @@ class FeedPoses(PoseSource):
             text = f"({where}) m is beyond the field's bounds"
             self._feed.problems.note(FeedProblem.OUTSIDE, text, time_ns)
             return None
-        self._estimator.measured(time_ns / NS, measurement.position_m)
+        self._estimator.measured(time_ns / NS, measurement.position_m, measurement.position_std_m)
         return measurement
 
     def _is_inside(self, measurement: PoseMeasurement) -> bool:

@@ -1,6 +1,7 @@
 """A camera on the network, by GStreamer under the system's Python: ``rtsp`` or ``rtp``.
 
 ``gst_sender.py rtsp PICTURES PORT`` serves rtsp://127.0.0.1:PORT/camera; PORT 0 takes a free one.
+``file FILE PORT LOST`` serves the H.264 of a Matroska file, without a share LOST of its pictures.
 ``rtp PICTURES PORT`` sends RTP and sender reports to PORT and PORT + 1. PICTURES is a pattern like
 ``folder/%03d.jpg``: coded as H.264 at 10 Hz, over and over. Prints the port once it is ready.
 """
@@ -24,12 +25,23 @@ def source(pictures: str) -> str:
 
 
 def serve(pictures: str, port: str) -> None:
-    """Serve RTSP until killed."""
+    """Serve pictures by RTSP until killed."""
+    serve_pipeline(f"{source(pictures)} ! {PAYLOADER}", port)
+
+
+def serve_file(file: str, port: str, lost: str) -> None:
+    """Serve a coded stream by RTSP."""
+    units = f"filesrc location={file} ! matroskademux ! h264parse ! video/x-h264,alignment=au"
+    serve_pipeline(f"{units} ! identity drop-probability={lost} ! {PAYLOADER}", port)
+
+
+def serve_pipeline(pipeline: str, port: str) -> None:
+    """Serve what a pipeline sends until killed."""
     server = GstRtspServer.RTSPServer()
     server.set_address("127.0.0.1")
     server.set_service(port)
     factory = GstRtspServer.RTSPMediaFactory()
-    factory.set_launch(f"( {source(pictures)} ! {PAYLOADER} )")
+    factory.set_launch(f"( {pipeline} )")
     factory.set_shared(True)
     server.get_mount_points().add_factory("/camera", factory)
     server.attach(None)
@@ -50,5 +62,5 @@ def send(pictures: str, port: str) -> None:
 
 if __name__ == "__main__":
     Gst.init(None)
-    {"rtsp": serve, "rtp": send}[sys.argv[1]](*sys.argv[2:])
+    {"rtsp": serve, "file": serve_file, "rtp": send}[sys.argv[1]](*sys.argv[2:])
     GLib.MainLoop().run()

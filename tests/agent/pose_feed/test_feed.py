@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from cav_agent.pose_feed.feed import NS, QUIET_S, PoseFeed
 from cav_agent.pose_feed.feed_poses import FeedPoses, TimeOffsetEstimator
 from cav_agent.pose_feed.fix import CameraMount, FeedProblem, FieldPlacement, Fix
+from cav_agent.pose_feed.json_lines import UNKNOWN_HEIGHT_STD_M
 from cav_agent.pose_feed.sources import FeedKind, FeedSource, PoseFeedSettings, parse_source
 from lab.localisation.pose_errors import ERROR_MODELS, PoseErrorModel
 from lab.localisation.pose_feed import FeedPlan, feed_lines
@@ -270,20 +271,27 @@ def test_the_same_seed_writes_the_same_feed():
 # --- the time offset
 
 
-def drive(offset_s: float, noise_m: float, *, bends: bool) -> TimeOffsetEstimator:
-    """A feed that is ``offset_s`` wrong and 2 m beside, over 20 s of a drive."""
+def drive(
+    offset_s: float, noise_m: float, *, bends: bool, climbs_m: float = 0.0
+) -> TimeOffsetEstimator:
+    """A feed that is ``offset_s`` wrong and 2 m beside, over 20 s of a drive.
+
+    ``climbs_m``: the road's height rises so far ever faster, and the feed knows no height.
+    """
     rng = np.random.default_rng(4)
 
     def at(time_s: float) -> tuple[float, float, float]:
         speed = 8.0 * time_s + (12.0 * math.sin(0.5 * time_s) if bends else 0.0)
-        return (speed, 6.0 * math.cos(0.4 * time_s) if bends else 0.0, 0.0)
+        height = climbs_m * (time_s / 20.0) ** 2
+        return (speed, 6.0 * math.cos(0.4 * time_s) if bends else 0.0, height)
 
     estimator = TimeOffsetEstimator()
     for n in range(200):
         time_s = 0.1 * n
         if n % 5 == 0:
             x, y, z = np.array(at(time_s + offset_s)) + rng.normal(0, noise_m, 3) + [2.0, -1.0, 0.0]
-            estimator.measured(time_s, (x, y, z))
+            std_m = (noise_m, noise_m, UNKNOWN_HEIGHT_STD_M if climbs_m else noise_m)
+            estimator.measured(time_s, (x, y, 0.0 if climbs_m else z), std_m)
         estimator.localised(time_s, at(time_s))
     return estimator
 
@@ -294,6 +302,12 @@ def test_a_drive_that_bends_tells_how_late_the_feed_is(offset_s):
     assert found is not None
     assert found.seconds == pytest.approx(offset_s, abs=5 * found.std_s + 0.01)
     assert found.std_s < 0.02
+
+
+def test_a_height_that_the_feed_does_not_know_says_nothing_of_its_time():
+    found = drive(0.2, 0.1, bends=True, climbs_m=60.0).offset()
+    assert found is not None
+    assert found.seconds == pytest.approx(0.2, abs=5 * found.std_s + 0.01)
 
 
 def test_a_straight_drive_at_one_speed_does_not_tell_and_says_so():

@@ -58,6 +58,40 @@ def test_the_date_of_rmc_goes_before_that_of_now():
     assert fix.heading_deg == pytest.approx(84.4)
 
 
+def test_a_leap_second_is_refused_once_and_the_times_after_it_are_right():
+    """2016-12-31 had a second 23:59:60; Unix time has none for it."""
+    parser, times_ns, refused = NmeaParser(), [], []
+    for clock, day in (("235959", "311216"), ("235960", "311216"), ("000000", "010117")):
+        for body in (
+            f"GPRMC,{clock},A,4807.038,N,01131.000,E,022.4,084.4,{day},003.1,W",
+            f"GPGGA,{clock},4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,",
+        ):
+            try:
+                fix = parser.receive(nmea(body), 0)
+            except BadReading as error:
+                refused.append(error.problem)
+            else:
+                times_ns += [] if fix is None else [fix.time_ns]
+    assert refused == [FeedProblem.MALFORMED]
+    assert times_ns == [1_483_228_799 * 10**9, 1_483_228_800 * 10**9]
+    with pytest.raises(BadReading):
+        JsonParser().receive(line(time_s=..., time="2016-12-31T23:59:60Z"))
+
+
+@pytest.mark.parametrize("order", ["RMC first", "GGA first"])
+def test_at_midnight_gga_is_of_the_day_that_follows_the_date_of_rmc(order):
+    parser, times_ns = NmeaParser(), []
+    for clock, day in (("235959.00", "230394"), ("000000.00", "240394"), ("000001.00", "240394")):
+        bodies = [
+            f"GPRMC,{clock},A,4807.038,N,01131.000,E,022.4,084.4,{day},003.1,W",
+            f"GPGGA,{clock},4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,",
+        ]
+        for body in bodies if order == "RMC first" else bodies[::-1]:
+            fix = parser.receive(nmea(body), 764_467_199 * 10**9)
+            times_ns += [] if fix is None else [fix.time_ns]
+    assert times_ns == [(764_467_199 + n) * 10**9 for n in range(3)]  # 1994-03-23 23:59:59
+
+
 def test_two_antennas_go_before_the_course_and_gst_before_the_table():
     parser = NmeaParser()
     parser.receive(nmea("GPHDT,274.07,T"), NOON_NS)
