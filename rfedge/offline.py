@@ -21,7 +21,7 @@ from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
 from rfcore.codec.sender.rate import FrameCosts
 from rfcore.dataset import Dataset
-from rfcore.errors import CodecError, DatasetError, InvalidData, PacketRejected
+from rfcore.errors import CodecError, DatasetError, InvalidData, InvalidInput, PacketRejected
 from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
@@ -135,7 +135,14 @@ class CodingSettings:
     check_decode: bool = False
     """Decode each slice and compare it, as ``DeltaEncoder`` does."""
     light: LightChange = LightChange.AUTO
-    """Whether the light of renders is changed where that saves bits."""
+    """Whether the light of renders is changed where that saves bits; its name will do."""
+
+    def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "light", LightChange(self.light))
+        except ValueError as error:
+            known = ", ".join(LightChange)
+            raise InvalidInput("light", f"{self.light!r} is not one of {known}") from error
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def bubblewrap_command(environment: Mapping[str, str], filter_fd: int) -> list[s
     program = shutil.which("bwrap")
     if program is None:
         raise BackendUnavailable(
-            "bwrap is not on PATH; install bubblewrap, or decode with Landlock (--decoder landlock)"
+            "bwrap is not on PATH; install bubblewrap, or choose Landlock (--decoder landlock)"
         )
     user = AS_ROOT if os.geteuid() == 0 else AS_USER
     command = [program, *NAMESPACES, *user, "--add-seccomp-fd", str(filter_fd)]

@@ -233,7 +233,7 @@ class Decode:
         kind, what = DecoderKind(self.decoder), f"decoding {len(drive.frames)} frames"
         with working(what), Decoders(kind, as_root=True, quiet=True) as decoders:
             if decoders.problem:
-                print(f"decoded in a {decoders.kind} sandbox: {decoders.problem}")
+                print(f"note: decoded in a {decoders.kind} sandbox ({decoders.problem})")
             decoded = decode_drive(drive, field, decoders.open)
             if film:
                 self._write_film(drive, self._compared(decoded, originals))

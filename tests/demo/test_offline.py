@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, LightChange
 from rfcore.codec.h264.qp_map import MaskSettings
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.dataset import Dataset, read_dataset
-from rfcore.errors import InvalidData
+from rfcore.errors import InvalidData, InvalidInput
 from rfcore.field import SplatField, render_field_view
 from rfcore.image import write_png
 from rfcore.native.yuv import i420_from_rgb
@@ -64,3 +64,9 @@ def test_another_field_is_refused_with_both_ids_named(drive, field):
     other = SplatField(Gaussians(g.means + 1, g.quaternions, g.log_scales, g.opacity_logits, g.sh))
     with pytest.raises(InvalidData, match=f"{field.field_id}, given {other.field_id}"):
         next(decode_drive(coded, other))
+
+
+def test_the_light_is_told_by_its_name_or_refused():
+    assert CodingSettings(light="off").light is LightChange.OFF
+    with pytest.raises(InvalidInput, match="light: 'dark' is not one of auto, off"):
+        CodingSettings(light="dark")
