@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
     from rfedge.sizing.estimate import Demand, Estimate, FleetEstimate, Sizing
+    from rfedge.sizing.hour import Hour
     from rfedge.sizing.tables import SizingTables
 
 
@@ -53,6 +55,17 @@ class Size:
     """The field of --drive."""
     frames: int = 24
     """Largest number of frames of --drive to measure."""
+    speed_kmh: float | None = None
+    """Also estimate an hour at this speed, km/h: bytes a km, the field's among them, and cost."""
+    hour: bool = False
+    """Also estimate an hour of a bus, a lorry and a robot taxi, whose cameras, speeds and roads are
+    assumptions."""
+    new_road: float = 1.0
+    """With --speed-kmh: share of the road whose field the vehicle does not hold yet."""
+    field_mb_per_km: float | None = None
+    """MB of the field of a kilometre; without it, as many as the sample's."""
+    price_per_gb: float | None = None
+    """Price of a GB in either direction, in any currency."""
     cells: Annotated[Path, FOLDER] = Path("out/size")
     """Folder of finished measurements, from which a stopped run goes on."""
     assumptions: Annotated[Assumptions, OmitArgPrefixes] = Assumptions()
@@ -82,13 +95,38 @@ class Size:
         )
         if self.plot is not None and self.plot.suffix not in (".svg", ".png", ".pdf"):
             raise InvalidInput("plot", f"{self.plot} does not end in .svg, .png or .pdf")
-        sizing = estimate(demand, self._tables(demand), self.assumptions)
+        tables = self._tables(demand)
+        sizing = estimate(demand, tables, self.assumptions)
+        hours = self._hours(sizing, tables)
         if self.json != "-":
             print_sizing(Console(), sizing)
+            if hours:
+                print_hours(Console(), hours)
         if self.plot is not None:
             write_sizing_plot(sizing, self.plot)
         if self.json is not None:
-            write_result(self.json, make_result("size", provenance(), {"sizing": sizing}))
+            made = {"sizing": sizing, **({"hours": hours} if hours else {})}
+            write_result(self.json, make_result("size", provenance(), made))
+
+    def _hours(self, sizing: Sizing, tables: SizingTables) -> list[Hour]:
+        """Return what is asked for: an hour of the vehicle, and of the named ones."""
+        from rfedge.sizing.estimate import Demand, estimate
+        from rfedge.sizing.hour import NAMED_VEHICLES, Hour, Road, sample_field_mb_per_km
+
+        if self.speed_kmh is None and not self.hour:
+            return []
+        per_km = self.field_mb_per_km
+        mb_per_km = sample_field_mb_per_km() if per_km is None else per_km
+        hours = []
+        if self.speed_kmh is not None:
+            road = Road(self.speed_kmh, self.new_road, mb_per_km, self.price_per_gb)
+            hours.append(Hour("yours", sizing.demand, road, sizing.estimates))
+        for named in NAMED_VEHICLES if self.hour else ():
+            demand = Demand(named.cameras, named.width_px, named.height_px, named.hz, self.db)
+            made = estimate(demand, tables, self.assumptions).estimates
+            road = Road(named.speed_kmh, named.new_share, mb_per_km, self.price_per_gb)
+            hours.append(Hour(named.name, demand, road, made))
+        return hours
 
     def _tables(self, demand: Demand) -> SizingTables:
         from rfcore.errors import InvalidInput
@@ -200,6 +238,39 @@ def _fleet_table(sizing: Sizing) -> RichTable:
             cells.insert(3, "none" if row.link_mbps is None else f"{row.link_mbps:.1f}")
         table.add_row(*cells)
     return table
+
+
+def print_hours(console: Console, hours: Sequence[Hour]) -> None:
+    """Print an hour of each vehicle, what it assumes, and how much new road a field is worth."""
+    from rich import box
+    from rich.table import Table
+
+    from rfedge.sizing.hour import OURS
+
+    priced = hours[0].road.price_per_gb is not None
+    title = "An hour of one vehicle"
+    table = Table(box=box.SIMPLE, pad_edge=False, title=title, title_justify="left")
+    names = ["vehicle", "codec", "GB up", "GB of fields", "MB a km", "a cell"]
+    for number, name in enumerate([*names, *(["cost"] if priced else [])]):
+        table.add_column(name, justify="right" if number > 1 else "left", no_wrap=True)
+    for hour in hours:
+        for row in hour.rows:
+            shown = [row.vehicle, row.codec, f"{row.up_gb:.2f}", f"{row.field_gb:.2f}"]
+            shown += [f"{row.mb_per_km:.1f}", f"{row.vehicles_per_cell}"]
+            table.add_row(*shown, *([] if row.price is None else [f"{row.price:.2f}"]))
+    console.print(table)
+    for hour in hours:
+        road = hour.road
+        limits = [f"{100 * share:.3g} % ({codec})" for codec, share in hour.most_new_share.items()]
+        console.print(
+            f"{hour.vehicle}: {_cameras(hour.demand)}; {road.speed_kmh:g} km/h, "
+            f"{100 * road.new_share:g} % of the road new. Fields included, {OURS} takes less "
+            f"while less of it is new than: {', '.join(limits)}."
+        )
+    console.print(
+        f"Field: {hours[0].road.field_mb_per_km:.1f} MB a km, fetched for new road alone. a cell: "
+        "vehicles that its uplink carries; fields come down. Bus, lorry and robot taxi are assumed."
+    )
 
 
 def write_sizing_plot(sizing: Sizing, path: Path) -> None:
