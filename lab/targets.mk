@@ -1,6 +1,6 @@
 # Targets that measure and record; the Makefile beside pyproject.toml includes them (`make help-lab`).
 .PHONY: results results-full figures stability bench sizing load load-transport load-receiver \
-	load-full load-links load-overload soak soak-short sample sample-field drive-long lpips-weights
+	load-full load-links load-overload soak soak-short sample sample-field drive-long dataset lpips-weights
 
 ##@ Results
 results results-full: build-full  ## record anew what takes two hours, or everything (DATA)
@@ -72,6 +72,11 @@ sample: build-full  ## render the street in samples/street anew (half an hour)
 
 drive-long: build-full  ## render 30 s of the sample's street at 10 Hz (16 minutes)
 	$(BIN)/streetgen build samples/localise/drive_30s.toml --split drive --out out/drive-long
+
+TRUTH := $(foreach of,empty vehicles,out/results/size/640x360/$(of)/transforms_drive.json)
+dataset: build-full  ## pack street, drives, fields, truth for others; sizes as `record.mk sizes` rendered
+	$(MAKE) -f lab/record.mk $(TRUTH) RFEDGE=$(BIN)/rfedge
+	$(BIN)/python -m lab.dataset_release $(ARGS)
 
 sample-field: build-full  ## train the field that ships in samples/fields (some minutes)
 	$(BIN)/python -m lab.sample_field samples/street $(ARGS)
