@@ -1,4 +1,4 @@
-"""Makes a page of the results of one kind: a sentence, a picture, tables, and their command.
+"""Makes a page of the results of one kind: its finding, a picture, tables, and their command.
 
 A page is made of every result file of its kind, a section each, so that it is never typed.
 """
@@ -26,7 +26,7 @@ class Report:
     kind: str
     title: str
     shows: str
-    """A sentence that says what the page shows."""
+    """A sentence that says what the page shows; what was found is in ``lab.pages.findings``."""
     parts: Parts
     draw: Draw | None = None
 
@@ -56,20 +56,36 @@ def bars(label: str, values: Callable[[Result], Iterable[tuple[str, float]]]) ->
 
 
 def page_of(
-    report: Report, results: Sequence[tuple[str, Result]], drawn: Mapping[str, Sequence[Path]]
+    report: Report,
+    finding: str,
+    results: Sequence[tuple[str, Result]],
+    drawn: Mapping[str, Sequence[Path]],
 ) -> str:
-    """Return the page of results by the names of their files, each with what was drawn of it."""
-    sections = [_section(report, *named, drawn.get(named[0], [])) for named in results]
-    return "\n\n".join([f"# {report.title}", report.shows, *sections]) + "\n"
+    """Return the page of results by the names of their files, each with what was drawn of it.
+
+    It opens with the finding, a sentence, and the first picture that there is.
+    """
+    pictures = {name: _picture(report, name, drawn.get(name, ())) for name, _ in results}
+    first = next((name for name, picture in pictures.items() if picture), None)
+    opening = [f"**{finding}**", pictures.pop(first) if first is not None else "", report.shows]
+    sections = [_section(report, *each, pictures.get(each[0], ""), drawn) for each in results]
+    texts = [f"# {report.title}", *(text for text in opening if text), *sections]
+    return "\n\n".join(texts) + "\n"
 
 
-def _section(report: Report, name: str, result: Result, drawn: Sequence[Path]) -> str:
-    pictures = [path for path in drawn if path.suffix == ".svg"]
-    shown = [f"![{report.title}: {name}](figures/{path.name})" for path in pictures[:1]]
-    more = ", ".join(f"[{path.stem}](figures/{path.name})" for path in pictures[1:])
+def _picture(report: Report, name: str, drawn: Sequence[Path]) -> str:
+    path = next((path for path in drawn if path.suffix == ".svg"), None)
+    return "" if path is None else f"![{report.title}: {name}](figures/{path.name})"
+
+
+def _section(
+    report: Report, name: str, result: Result, picture: str, drawn: Mapping[str, Sequence[Path]]
+) -> str:
+    more = [path for path in drawn.get(name, ()) if path.suffix == ".svg"][1:]
+    links = ", ".join(f"[{path.stem}](figures/{path.name})" for path in more)
     parts = (part.markdown() if isinstance(part, Table) else part for part in report.parts(result))
-    texts = [f"## {name}", *shown, *parts, *([f"More figures: {more}."] if more else [])]
-    return "\n\n".join([*texts, _measured(name, result)])
+    texts = [f"## {name}", picture, *parts, f"More figures: {links}." if more else ""]
+    return "\n\n".join([*(text for text in texts if text), _measured(name, result)])
 
 
 def folded(summary: str, text: str) -> str:

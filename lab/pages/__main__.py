@@ -1,13 +1,14 @@
 """``make figures``: pages and pictures of all recorded results, and the headline of the README.
 
-``python -m lab.pages`` writes ``lab/results/KIND.md`` for every kind of result, ``index.md`` that
-lists them, ``figures/``, and what stands between two marks in ``README.md``.
+``python -m lab.pages`` writes ``lab/results/KIND.md`` for every kind of result, ``losses.md``,
+``index.md`` that sums up and lists them, ``figures/``, and what stands between two marks in
+``README.md``.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from lab.adapt.measure import REPORT as ADAPT
@@ -20,10 +21,13 @@ from lab.head import REPORT as HEAD
 from lab.latency.report import REPORT as LATENCY
 from lab.live.report import REPORT as LIVE
 from lab.localisation.measure import REPORT as LOCALISE
+from lab.pages.findings import FINDINGS
 from lab.pages.loads import LOADS, RATIO
+from lab.pages.losses import losses_parts
 from lab.pages.product import REPORTS, headline
 from lab.pages.sizing import REPORT as SIZING
 from lab.pages.suites import ATTACKS, FAULTS, RESULTS, STABILITY
+from lab.pages.summary import comparisons, summary_parts, write_summary_figures
 from lab.paper.figures import REPORT as PAPER
 from lab.report import Report, page_of
 from lab.rig.report import REPORT as RIG
@@ -34,6 +38,7 @@ from lab.tcp.run import REPORT as TCP
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.program import verbs_of
+from rfedge.report.tables import Table
 from rfedge.results import Result, read_result
 from rfedge.sizing.tables import SHIPPED
 
@@ -49,12 +54,14 @@ KINDS: Mapping[str, Report] = {
     )
 }
 """Every kind of result with how it is shown, in the order of the index."""
-INDEX = """# Recorded results
+INDEX = "# Recorded results"
+PAGES = """## Every page
 
 Every page is generated from the JSON files beside it by `make figures`, and names the command,
 revision and machine of its figures. Machines are shared and noisy: compare within a table, not
 across machines.
 """
+LOSSES = "# Where it loses"
 
 Recorded = dict[str, list[tuple[str, Result]]]
 
@@ -82,15 +89,31 @@ def write_figures(results: Recorded, folder: Path) -> dict[str, list[Path]]:
         for name, result in named if draw is not None else ():
             assert draw is not None
             drawn[name] = draw(result, folder, name)
+    drawn["index"] = write_summary_figures(comparisons(results["compare"]), folder)
     return drawn
 
 
 def pages(results: Recorded, drawn: Mapping[str, Sequence[Path]]) -> dict[str, str]:
-    """Return the text of each page by its name, the index among them."""
+    """Return the text of each page by its name, index and losses among them."""
     shown = [report for kind, report in KINDS.items() if kind in results]
-    texts = {r.kind: _with_moved(page_of(r, results[r.kind], drawn)) for r in shown}
+    texts = {}
+    for report in shown:
+        named = results[report.kind]
+        page = page_of(report, FINDINGS[report.kind](named), named, drawn)
+        texts[report.kind] = _with_moved(page)
     lines = [f"* [{report.title}]({report.kind}.md): {report.shows}" for report in shown]
-    return {**texts, "index": "\n".join([INDEX, *lines, ""])}
+    lines.insert(
+        0, "* [Where it loses](losses.md): Where it sends more bits, takes longer or waits."
+    )
+    opening = _texts(INDEX, summary_parts(comparisons(results["compare"])))
+    losses = _texts(LOSSES, losses_parts(results))
+    return {**texts, "losses": losses, "index": "\n".join([opening, PAGES, *lines, ""])}
+
+
+def _texts(title: str, parts: Iterable[str | Table]) -> str:
+    """Return paragraphs and tables below a title."""
+    texts = (part.markdown() if isinstance(part, Table) else part for part in parts)
+    return "\n\n".join([title, *texts]) + "\n"
 
 
 def _with_moved(page: str) -> str:

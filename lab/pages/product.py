@@ -58,7 +58,7 @@ def headline(compared: Result, harder: Result) -> str:
     sentence = (
         f"**{min(synthetic):.0f} to {max(synthetic):.0f} % fewer bits** than x264 with the same "
         f"tools, at equal PSNR, on synthetic streets, and **{real:.0f} %** on a real street's "
-        f"second pass; in rain **{rain:.0f} % more**."
+        f"second pass; in rain **{abs(rain):.0f} % {'more' if rain > 0 else 'fewer'}**."
     )
     lines = []
     for row in fair:

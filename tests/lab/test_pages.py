@@ -31,7 +31,9 @@ def test_every_recorded_result_renders_in_tables_that_fit_a_screen(results):
     made = pages(results, {})
     for kind, named in results.items():
         page = made[kind]
-        assert page.startswith(f"# {KINDS[kind].title}\n\n{KINDS[kind].shows}\n")
+        title, found, shows, *_ = page.split("\n\n")
+        assert (title, shows) == (f"# {KINDS[kind].title}", KINDS[kind].shows)
+        assert re.fullmatch(r"\*\*[^\n]*\d[^\n]*\.\*\*", found), "a sentence with a figure opens it"
         for name, result in named:
             assert f"\n## {name}\n" in page
             assert result["command"] in page
@@ -39,7 +41,8 @@ def test_every_recorded_result_renders_in_tables_that_fit_a_screen(results):
             len(re.split(r"(?<!\\)\|", line)) - 2 for line in page.splitlines() if line[:1] == "|"
         }
         assert max(widths, default=1) <= PAGE_COLUMNS, kind
-    assert set(made) == {*KINDS, "index"} - {"soak"}, "each kind has a page and a line of the index"
+    assert set(made) == {*KINDS, "index", "losses"} - {"soak"}, "each kind has a page"
+    assert all(f"]({name}.md)" in made["index"] for name in set(made) - {"index"})
 
 
 def test_a_page_names_the_command_of_today(results):
