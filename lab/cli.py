@@ -27,6 +27,7 @@ from lab.servers import EvalScale
 from lab.size_tables import EvalSizing
 from lab.tcp import EvalTcp
 from lab.truth import EvalLiveTruth
+from lab.webrtc import EvalWebrtc
 from lab.world import EvalWorld
 from rfcore.program import parse_options, run_program
 
@@ -51,6 +52,7 @@ Verb = (
     | Annotated[EvalScale, subcommand("scale")]
     | Annotated[EvalSizing, subcommand("size-tables")]
     | Annotated[EvalTcp, subcommand("tcp")]
+    | Annotated[EvalWebrtc, subcommand("webrtc")]
     | Annotated[EvalWorld, subcommand("world")]
 )
 

@@ -201,6 +201,8 @@ $(OUT)/live-truth.json: | $(OUT)
 	$(LAB) live-truth --before 5e03a6d4 $(if $(DATA),--comma $(DATA)/comma2k19) --out $@
 $(OUT)/tcp.json: | $(OUT)  # as root: network namespaces
 	$(LAB) tcp --out $@
+$(OUT)/webrtc.json: | $(OUT)  # as root, on two idle cores; peers: pip install aiortc wrtc
+	$(LAB) webrtc --cells $(OUT)/webrtc --out $@
 # Ten pictures a second do not tell apart round trips that are shorter than 100 ms.
 $(OUT)/robust.json: $(call drive,dusk) $(call drive,lane-0.6) | $(OUT)
 	$(LAB) robust --dusk dusk@10=$< --lane lane-0.6@10=$(word 2,$^) --rtts-ms 50 250 --seeds 20 --processes $(shell nproc) \

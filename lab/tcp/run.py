@@ -5,13 +5,11 @@ from __future__ import annotations
 import ctypes
 import os
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,6 +21,7 @@ from rich.console import Console
 
 from lab.report import Report
 from lab.tcp import EvalTcp
+from lab.tcp.wire import checked, wired
 from rfcore.errors import RfedgeError
 from rfcore.link.lossy import LossyLink, PacketLoss
 from rfcore.link.shaper import Connection, Link, LinkProfile
@@ -213,32 +212,14 @@ def _messages(
 @contextmanager
 def _wire(job: EvalTcp, rate_mbps: float, loss_percent: float) -> Iterator[tuple[str, str]]:
     """Yield two new network namespaces with a wire between them, on which nft drops packets."""
-    names = tuple(f"rftcp{os.getpid()}{end}" for end in "nf")
-    with ExitStack() as stack:
-        for name in names:
-            _run("ip", "netns", "add", name)
-            stack.callback(_run, "ip", "netns", "del", name)
-        numbers = ("0", f"{job.rtt_ms}", f"{rate_mbps}")
-        words = [sys.executable, "-m", "lab.tcp.wire", *names, SUBNET, *numbers]
-        wire = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE))
-        stack.callback(wire.kill)
-        assert wire.stdout is not None
-        if wire.stdout.readline() != b"ready\n":
-            raise RfedgeError("the wire between the namespaces could not be made")
-        os.sched_setscheduler(wire.pid, os.SCHED_FIFO, os.sched_param(1))
-        for name in names if loss_percent else ():
+    with wired(SUBNET, 0.0, job.rtt_ms, [rate_mbps]) as wire:
+        for name in (wire.near, wire.far) if loss_percent else ():
             lose = f"numgen random mod 1000000 < {round(1e4 * loss_percent)} drop"
             hook = "{ type filter hook input priority 0 ; }"
             add = ("table inet loss", f"chain inet loss in {hook}", f"rule inet loss in {lose}")
             rules = "".join(f"add {each}\n" for each in add)
-            _run("ip", "netns", "exec", name, "nft", rules)
-        yield names[0], names[1]
-
-
-def _run(*command: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RfedgeError(f"{' '.join(command)}: {done.stderr.strip()}")
+            checked("ip", "netns", "exec", name, "nft", rules)
+        yield wire.near, wire.far
 
 
 def _within(namespace: str, make: Callable[[], Made]) -> Made:
