@@ -69,17 +69,11 @@ class SteppedRate:
 class Direction:
     """Packets from one device to the other."""
 
-    def __init__(
-        self, source: int, sink: int, rates_bps: Sequence[float], delay_s: float, loss: float,
-        seed: str,
-    ) -> None:  # fmt: skip
-        self.source = source
-        self._sink = sink
+    def __init__(self, ends: tuple[int, int], made: Link[bytes], loss: float, seed: str) -> None:
+        self.source, self._sink = ends
         self._loss = loss
         self._rng = random.Random(seed)
-        self.rate = SteppedRate(rates_bps)
-        profile = LinkProfile(rates_bps[0], delay_s)
-        self._link: Link[bytes] = Link(profile, LinkParts(self.rate))
+        self._link = made
 
     def take(self, now: float) -> None:
         """Read what came; lose some."""
@@ -149,21 +143,21 @@ def wired(
 
     Needs root. The wire has real-time priority: it stands for a network.
     """
-    names = tuple(f"rftcp{os.getpid()}{end}" for end in "nf")
+    near, far = (f"rftcp{os.getpid()}{end}" for end in "nf")
     with ExitStack() as stack:
-        for name in names:
+        for name in (near, far):
             checked("ip", "netns", "add", name)
             stack.callback(checked, "ip", "netns", "del", name)
             checked("ip", "-n", name, "link", "set", "lo", "up")
         numbers = map(str, (loss_percent, rtt_ms, *rates_mbps))
-        words = [sys.executable, "-m", "lab.tcp.wire", *names, subnet, *numbers]
+        words = [sys.executable, "-m", "lab.tcp.wire", near, far, subnet, *numbers]
         process = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE))
         stack.callback(process.kill)
         assert process.stdout is not None
         if process.stdout.readline() != b"ready\n":
             raise RfedgeError("the wire between the namespaces could not be made")
         os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(1))
-        yield Wire(*names, process)
+        yield Wire(near, far, process)
 
 
 def checked(*command: str) -> str:
@@ -182,12 +176,22 @@ def main(
     place(names[0], near, f"{subnet}.1", f"{subnet}.2")
     place(names[1], far, f"{subnet}.2", f"{subnet}.1")
     rates_bps = [1e6 * float(each) for each in rates_mbps]
-    numbers = rates_bps, float(rtt_ms) / 2e3, float(loss_percent) / 100
-    ways = (
-        Direction(*ends, *numbers, f"{SEED} up"),
-        Direction(*ends[::-1], *numbers, f"{SEED} down"),
-    )
-    signal.signal(signal.SIGUSR1, lambda *_: [way.rate.step() for way in ways])
+    profile = LinkProfile(rates_bps[0], float(rtt_ms) / 2e3)
+    rates = (SteppedRate(rates_bps), SteppedRate(rates_bps))
+    loss = float(loss_percent) / 100
+    ways = [
+        Direction((source, sink), Link(profile, LinkParts(rate)), loss, f"{SEED} {name}")
+        for source, sink, rate, name in (
+            (ends[0], ends[1], rates[0], "up"),
+            (ends[1], ends[0], rates[1], "down"),
+        )
+    ]
+
+    def step(*_: object) -> None:
+        for rate in rates:
+            rate.step()
+
+    signal.signal(signal.SIGUSR1, step)
     print("ready", flush=True)
     forward(ways)
 

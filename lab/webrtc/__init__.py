@@ -33,8 +33,8 @@ class EvalWebrtc(Experiment):
         f"vehicles@10={sample_path('street/transforms_drive_vehicles.json')}"
     )
     """NAME@HZ=DATASET of the drive, a transforms.json."""
-    peers: tuple[str, ...] = ("libwebrtc-av1", "libwebrtc-vp8", "aiortc-h264", "aiortc-vp8")
-    """Engines and their codecs."""
+    peers: tuple[str, ...] = ("libwebrtc-av1", "libwebrtc-vp8", "aiortc-h264")
+    """Engines and their codecs; libwebrtc-vp9 and aiortc-vp8 are there, too."""
     rates_mbps: tuple[float, ...] = (0.3, 1.0, 4.0)
     """Rates of the link."""
     step_mbps: tuple[float, float] | None = (2.0, 0.5)
@@ -43,7 +43,7 @@ class EvalWebrtc(Experiment):
     """Round trips without queue."""
     losses: tuple[float, ...] = (0.0, 1.0, 5.0)
     """IP packets lost in either direction, percent."""
-    settle_s: float = 10.0
+    settle_s: float = 8.0
     """Seconds before the measured ones, in which senders find the link's rate."""
     seconds: float = 20.0
     """Measured seconds of each cell."""

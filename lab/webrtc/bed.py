@@ -26,8 +26,10 @@ from rfedge.processes import command_of, service
 
 SUBNET, FAR = "10.218.0", "10.218.0.2"
 NEAR_CORE, FAR_CORE = 0, 1
-START_S, END_S = 60.0, 20.0
+START_S, END_S = 180.0, 20.0
 VEHICLE = "cav"
+ROUNDED_NS = 1_000_000
+"""Capture times on the wire differ by less."""
 
 
 @dataclass(frozen=True)
@@ -108,10 +110,8 @@ class LinkBed:
         lines = [json.loads(line) for line in report.read_text().splitlines()]
         captured = numbers_of(lines, len(self.camera.cycle), self.hz)
         times_ns, stamps, lumas = read_pictures(shown)
-        known = {ns: number for number, ns in captured.items()}
-        numbers = [known[ns] for ns in stamps.tolist() if ns in known]
-        told = [k for k, ns in enumerate(stamps.tolist()) if ns in known]
-        pictures_shown = Shown([times_ns[k] for k in told], numbers, [lumas[k] for k in told])
+        numbers = numbers_at(stamps.tolist(), captured)
+        pictures_shown = Shown(times_ns, numbers, lumas)
         return figures_of(pictures_shown, captured, self.camera, window), sent_bytes
 
     def _drive(self, source: Path) -> Path:
@@ -224,3 +224,17 @@ def numbers_of(lines: list[dict[str, int]], length: int, hz: float) -> Mapping[i
             raise InvalidData(f"two pictures of the report are number {number}")
         captured[number] = line["capture_time_ns"]
     return captured
+
+
+def numbers_at(stamps_ns: list[int], captured_ns: Mapping[int, int]) -> list[int]:
+    """Return the numbers of pictures by their capture times, which the wire rounds.
+
+    Raises ``InvalidData`` for a time at which none was captured.
+    """
+    numbers = []
+    for stamp_ns in stamps_ns:
+        number = min(captured_ns, key=lambda k: abs(captured_ns[k] - stamp_ns))
+        if abs(captured_ns[number] - stamp_ns) > ROUNDED_NS:
+            raise InvalidData(f"a picture of {stamp_ns} ns was shown, but none was captured then")
+        numbers.append(number)
+    return numbers

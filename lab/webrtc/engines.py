@@ -53,7 +53,7 @@ class Engine(Protocol):
 def engine_of(name: str, codec: str) -> Engine:
     """Return one end; raise ``BackendUnavailable``, saying what to install, without its package."""
     try:
-        return {"aiortc": AiortcEngine, "libwebrtc": LibwebrtcEngine}[name](codec)
+        return AiortcEngine(codec) if name == "aiortc" else LibwebrtcEngine(codec)
     except ModuleNotFoundError as error:
         package = "aiortc" if name == "aiortc" else "wrtc"
         raise BackendUnavailable(f"{error.name} is missing: pip install {package}") from error
@@ -104,7 +104,7 @@ class AiortcEngine:
 
         frame = VideoFrame(*capture.picture.size_px, "yuv420p")
         for plane, samples in zip(frame.planes, capture.picture.planes, strict=True):
-            rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+            rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
             rows[: samples.shape[0], : samples.shape[1]] = samples
         frame.pts = round(capture.number * VIDEO_CLOCK_HZ / hz)
         frame.time_base = fractions.Fraction(1, VIDEO_CLOCK_HZ)
@@ -117,7 +117,7 @@ class AiortcEngine:
         while True:
             frame = await track.recv()
             plane = frame.planes[0]
-            rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+            rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
             show(time.time_ns(), frame.pts, rows[: frame.height, : frame.width].copy())
 
     async def close(self) -> None:

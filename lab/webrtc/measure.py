@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,9 +51,9 @@ class ShownPictures:
 
     def write(self, path: Path) -> None:
         """Write all that were shown: times, time stamps, and each picture's luma."""
-        lumas = {f"luma{i}": luma for i, luma in enumerate(self._lumas)}
-        times_ns = np.array(self._times_ns, np.int64)
-        np.savez(path, times_ns=times_ns, stamps=np.array(self._stamps, np.int64), **lumas)
+        arrays: dict[str, Any] = {f"luma{i}": luma for i, luma in enumerate(self._lumas)}
+        arrays["times_ns"] = np.array(self._times_ns, np.int64)
+        np.savez(path, stamps=np.array(self._stamps, np.int64), **arrays)
 
 
 @dataclass(frozen=True)
@@ -175,9 +176,11 @@ def figures_of(
         ages_ms.append((time_ns - captured) / 1e6)
         qualities_db.append(luma_psnr(luma, camera.at(number)))
     in_window = [t for t in shown.times_ns if window.begin_ns <= t < window.end_ns]
-    ages = np.percentile(ages_ms, (50, 95, 99)).tolist() if ages_ms else [None] * 3
+    p50, p95, p99 = np.percentile(ages_ms, (50, 95, 99)).tolist() if ages_ms else [None] * 3
     return Figures(
-        *ages,
+        p50_ms=p50,
+        p95_ms=p95,
+        p99_ms=p99,
         frozen_percent=frozen_percent(in_window, window),
         psnr_db=float(np.mean(qualities_db)) if ages_ms else None,
         shown_hz=len(in_window) / window.length_s,

@@ -143,14 +143,14 @@ class Bench:
         """The digest of the field."""
         return load_field(self.job.field).field_id
 
-    def key(self, **facts: str | float | None) -> dict[str, str | float | int | None]:
-        """Return the key of a cell: all that its content depends on."""
+    def key(self, *also: str, **facts: str | float | None) -> dict[str, str | float | int | None]:
+        """Return the key of a cell: all that its content depends on, ``also`` the code of it."""
         return {
             **facts,
             "verb": "webrtc",
             "frames": self.drive.digest,
             "hz": self.drive.name.rate_hz,
-            "program": program_version("lab/webrtc", "lab/tcp", "cav_agent", "mec_server"),
+            "program": program_version(*also),
         }
 
     @cached_property
@@ -172,13 +172,15 @@ class Bench:
         """Return the row of a peer, or of us at a CRF, over a link."""
         job = self.job
         key = self.key(
+            *("lab/webrtc", "lab/tcp", "cav_agent", "mec_server"),
             peer=peer,
             engine=self.engines.get(peer, tcp_control()),
             link=str(link),
             seconds=job.seconds,
             settle_s=job.settle_s,
             crf=crf,
-            **({} if crf is None else {"effort": job.effort, "delay_ms": job.delay_ms}),
+            effort=None if crf is None else job.effort,
+            delay_ms=None if crf is None else job.delay_ms,
         )
         (kept,) = self.run.store.rows(key, lambda: [asdict(self._measured(link, peer, crf))])
         (row,) = rows_of(WebrtcRow, [kept])

@@ -10,7 +10,7 @@ import pytest
 
 from lab.report import page_of
 from lab.tcp.wire import SteppedRate
-from lab.webrtc.bed import numbers_of
+from lab.webrtc.bed import numbers_at, numbers_of
 from lab.webrtc.camera import CameraPictures, captured, there_and_back
 from lab.webrtc.engines import engine_of
 from lab.webrtc.measure import (
@@ -158,6 +158,13 @@ def test_an_agents_report_gives_each_capture_its_number():
     assert numbers_of(lines, 4, HZ) == {k: ms * MS for k, ms in at_ms.items()}
     with pytest.raises(InvalidData):
         numbers_of([lines[0], lines[0]], 4, HZ)
+
+
+def test_a_capture_time_that_was_rounded_has_its_number():
+    captured_ns = {0: 1_000_000_999, 1: 1_100_000_001}
+    assert numbers_at([1_100_000_000, 1_000_000_000], captured_ns) == [1, 0]
+    with pytest.raises(InvalidData):
+        numbers_at([1_050_000_000], captured_ns)
 
 
 # --- equal quality
