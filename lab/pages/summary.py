@@ -42,8 +42,8 @@ Bits are those of rfedge in percent more than the rival's at equal luma PSNR (BD
 is a saving. *x264* has every tool that our slices have, and no other, at preset medium; *strongest*
 is the best of all rivals however slow, named in brackets. *ms* is processor time of sender and
 receiver a frame: ours / that x264 / the strongest, on a shared machine: compare them within a row
-alone. *MB* is the field, sent once; *drives until paid* says after how many such drives it is. The last rows of the table are drives that save least:
-[where it loses](losses.md)."""
+alone. *MB* is the field, sent once; *drives until paid* says after how many such drives it is. The
+last rows of the table are drives that save least: [where it loses](losses.md)."""
 
 FILES = ("compare", "compare-harder", "compare-size")
 """Comparisons with the fields that are meant to be used; ``compare-small`` tries smaller ones."""
