@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.report import page_of
 from lab.tcp.wire import SteppedRate
 from lab.webrtc.bed import numbers_at, numbers_of
 from lab.webrtc.camera import CameraPictures, captured, there_and_back
@@ -23,7 +22,7 @@ from lab.webrtc.measure import (
     numbered,
     read_pictures,
 )
-from lab.webrtc.report import OURS, REPORT, WebrtcRow, paired
+from lab.webrtc.report import OURS, WebrtcRow, paired, webrtc_parts
 from lab.webrtc.run import crf_at
 from rfcore.errors import BackendUnavailable, InvalidData
 from rfcore.image import I420
@@ -201,6 +200,11 @@ def test_a_peer_is_compared_with_our_cheapest_row_of_its_quality():
     assert not pair.is_equal
 
 
+def test_showing_fewer_pictures_saves_nothing():
+    (pair,) = paired([ROW, ours(36.0, 100_000, shown_hz=5.0)])
+    assert pair.bytes_percent == pytest.approx(100)
+
+
 def test_a_peer_that_shows_nothing_is_no_better():
     nothing = dict.fromkeys(("p50_ms", "p95_ms", "p99_ms", "psnr_db"))
     dead = replace(ROW, frozen_percent=100.0, shown_hz=0.0, **nothing)
@@ -217,10 +221,10 @@ def test_the_page_says_who_was_better():
     rows.append(replace(rows[2], step_bps=5e5))
     result = {
         "hz": HZ, "field_bytes": 800_000, "engines": ["wrtc 0.1.0"], "tcp": "cubic",
-        "delay_ms": 300.0, "command": "rfedge-lab webrtc", "revision": "abc",
-        "host": {"cpu": "a CPU", "cores": 2, "isa": "avx2"}, "rows": [vars(row) for row in rows],
+        "delay_ms": 300.0, "rows": [vars(row) for row in rows],
     }  # fmt: skip
-    page = page_of(REPORT, [("webrtc", json.loads(json.dumps(result)))], {})
+    parts = webrtc_parts(json.loads(json.dumps(result)))
+    page = "\n".join(part if isinstance(part, str) else part.markdown() for part in parts)
     assert "**libwebrtc-av1**, 2 links" in page
     assert "at most half in 2; p99 no higher in 1" in page
     assert "1, then 0.5" in page
