@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Any, TextIO
 
+import numpy as np
 import structlog
 
 from cav_agent.deadline import DeadlineController, Step
@@ -127,6 +128,7 @@ class DriveObserver:
         self._frame_log = frame_log
         self._unacknowledged: Counter[tuple[str, str]] = Counter()
         self._problem = ""
+        self._latency_ms: list[float] = []
         self._logged_crf: float | None = None
         self._pose_state: LocalisationState | None = None
         self._feed_offset_s: float | None = None
@@ -148,16 +150,23 @@ class DriveObserver:
             self._delay_watch.acked(result)
 
     def quality(self) -> dict[str, float]:
-        """Return the luma PSNR of the mean squared error of all acknowledged pictures, if any."""
+        """Return the luma PSNR of the mean squared error of all acknowledged pictures, and the
+        percentiles of their time from capture to Ack, if any."""
         if not self._luma_mse_sum:
             return {}
-        return {"psnr_db": _psnr_db(self._luma_mse_sum / self._measured)}
+        p50_ms, p99_ms = np.percentile(self._latency_ms, (50, 99))
+        return {
+            "psnr_db": round(_psnr_db(self._luma_mse_sum / self._measured), 2),
+            "latency_p50_ms": round(float(p50_ms), 1),
+            "latency_p99_ms": round(float(p99_ms), 1),
+        }
 
     def _take_quality(self, result: FrameResult) -> None:
         encoded = result.encoded
         if result.outcome is Outcome.ACKED and encoded and encoded.luma_mse is not None:
             self._luma_mse_sum += encoded.luma_mse
             self._measured += 1
+            self._latency_ms.append(1e3 * (result.latency_s or 0.0))
 
     def explanation(self) -> str:
         """Return why no picture of a drive was acknowledged, and what to do."""

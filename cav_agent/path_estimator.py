@@ -69,11 +69,14 @@ class DeliverySample:
     own_ns: int = 0
     is_stall: bool = False
     """It may be a stall: it was the first that is slower than those before it."""
+    longest_ns: int = 0
+    """``rtt_ns``, or more of it where the answer before waited behind the vehicle's own downloads:
+    the path may have begun with this packet so much earlier."""
 
     @property
     def bytes_per_ns(self) -> float:
         """The rate that the answer proves."""
-        return self.size_bytes / self.rtt_ns
+        return self.size_bytes / max(self.rtt_ns, self.longest_ns)
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,8 @@ class PathEstimator:
         self._shortest: deque[DeliverySample] = deque()
         """Samples of the window that none after them undercuts: the first has the minimum."""
         self._answered_ns: int | None = None
+        self._answered_own_ns = 0
+        """As much as the last answer may have waited behind the vehicle's own downloads."""
         self._means = (0.0, 0.0, 0.0)
         """Running means of size, of its square, and of size times round trip."""
         self._before_stall: Knowledge | None = None
@@ -124,7 +129,7 @@ class PathEstimator:
         transmission: no more than the path has. None before the first answer."""
         if not self._samples:
             return None
-        return max(8e9 * sample.size_bytes / max(sample.rtt_ns, 1) for sample in self._samples)
+        return 8e9 * self._proven()
 
     def sent(self, key: Hashable, size_bytes: int, now_ns: int) -> None:
         """Note that a packet of ``size_bytes`` went out."""
@@ -153,8 +158,11 @@ class PathEstimator:
         start_ns = self._start_ns(packet, self._answered_ns)
         rtt_ns = max(1, now_ns - start_ns)
         own_ns = min(rtt_ns, self._own_wait_ns(start_ns, now_ns))
+        earliest_ns = max(packet.sent_ns, start_ns - self._answered_own_ns)
+        longest_ns = now_ns - earliest_ns
+        self._answered_own_ns = min(longest_ns, self._own_wait_ns(earliest_ns, now_ns))
         self._answered_ns = now_ns
-        sample = DeliverySample(packet.size_bytes, rtt_ns, now_ns, own_ns)
+        sample = DeliverySample(packet.size_bytes, rtt_ns, now_ns, own_ns, longest_ns=longest_ns)
         return self._add(sample)
 
     def room_bytes(self, ready_ns: int, due_ns: int, now_ns: int, share: float = 1.0) -> float:

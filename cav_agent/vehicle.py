@@ -129,7 +129,7 @@ class Vehicle:
 
     @property
     def quality(self) -> dict[str, float]:
-        """The luma PSNR of all acknowledged pictures, ``psnr_db``; empty without one."""
+        """Luma PSNR of all acknowledged pictures and their latency; empty without one."""
         return {} if self._observer is None else self._observer.quality()
 
     def stop(self) -> None:

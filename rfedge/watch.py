@@ -25,6 +25,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
 import av
+import numpy as np
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
@@ -206,6 +207,28 @@ class WatchSettings:
         return Subscription(self.vehicle_ids, encoding)
 
 
+class Summary:
+    """Counts pictures and keeps their ages, for one line at the end."""
+
+    def __init__(self) -> None:
+        self._age_ms: list[float] = []
+        self._missed = 0
+
+    def add(self, picture: TwinPicture) -> None:
+        """Count a picture, and those missed before it."""
+        self._age_ms.append(picture.age_ns / 1e6)
+        self._missed += picture.skipped
+
+    def say(self) -> None:
+        """Say how many there were and how old, if there were any."""
+        if self._age_ms:
+            p50, p95, p99 = np.percentile(self._age_ms, (50, 95, 99))
+            _say(
+                f"{len(self._age_ms)} pictures, {self._missed} missed; "
+                f"age p50 {p50:.0f}, p95 {p95:.0f}, p99 {p99:.0f} ms"
+            )
+
+
 ObjectsOf = Callable[[ObjectsRequest], Iterator[ObjectsSeen]]
 """Yields a server's objects on the ground of one field."""
 
@@ -315,8 +338,9 @@ def watch(
     Files are whole when it returns or raises. Raises ``RfedgeError`` if the source is not there or
     refuses.
     """
-    pictures = 0
+    pictures, summary = 0, Summary()
     with ExitStack() as stack:
+        stack.callback(summary.say)
         folder = PictureFolder(settings.folder) if settings.folder else None
         video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
         mcap = None
@@ -339,6 +363,7 @@ def watch(
             print(_line(message), flush=True)
             if isinstance(message, Departure):
                 continue
+            summary.add(message)
             if folder is not None:
                 folder.keep(message)
             if video is not None:

@@ -16,6 +16,8 @@ def row_of(**changes: object) -> LoadRow:
         held=False,
         p50_ms=20.5,
         p99_ms=None,
+        due=800,
+        answered=790,
         on_time_percent=97.25,
         on_time_at_least_percent=96.1,
         fairness=0.9,
@@ -45,7 +47,7 @@ def row_of(**changes: object) -> LoadRow:
 
 def load_run(vehicles: int, *, held: bool, mode: Mode = Mode.RECEIVER, hz: float = 10.0) -> Run:
     broken = () if held else ("p99 130 ms above 100 ms",)
-    verdict = Verdict(broken, 20.5, 130.0, 97.25, 96.1, 0.9, f"limit of {vehicles}")
+    verdict = Verdict(broken, 20.5, 130.0, 800, 790, 97.25, 96.1, 0.9, f"limit of {vehicles}")
     row = row_of(mode=str(mode), vehicles=vehicles, hz=hz, held=held, broken=broken, p99_ms=130.0)
     row = replace(row, limited_by=verdict.limited_by)
     latency_ms = [10.0 + k for k in range(20)]

@@ -42,11 +42,15 @@ LIMIT = 1 << 24
 Integers = NDArray[np.int32]
 
 
+class TooAlike(InvalidInput):
+    """Numbers so alike that a reader would take their stream for a bomb."""
+
+
 def encode_columns(values: Integers) -> tuple[dict[str, list[int]], NDArray[np.uint8]]:
     """Return the header of ``values`` int32 [N, C], and their stream.
 
     The header is {"lowest": [...], "bytes": [...]} with one number a column. Raises
-    ``InvalidInput`` for values so alike that a reader would take the stream for a bomb.
+    ``TooAlike`` for values that compress better than a reader accepts.
     """
     lowest = values.min(axis=0) if len(values) else np.zeros(values.shape[1], np.int32)
     highest = values.max(axis=0) if len(values) else lowest
@@ -56,7 +60,7 @@ def encode_columns(values: Integers) -> tuple[dict[str, list[int]], NDArray[np.u
     )
     stream = lzma.compress(planes, lzma.FORMAT_RAW, filters=FILTERS)
     if len(planes) > MAX_INFLATION * len(stream):
-        raise InvalidInput(
+        raise TooAlike(
             "field",
             f"its numbers are so alike that they compress over {MAX_INFLATION}-fold, which readers "
             "refuse as a decompression bomb; save it uncompressed (rfedge train --plain, rfedge "

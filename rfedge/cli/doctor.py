@@ -17,6 +17,10 @@ from rfedge.arguments import is_field_file, open_field
 if TYPE_CHECKING:
     from rfcore.dataset.source import Source
 
+PLY_HEADER_BYTES = 8192
+SPLAT_PROPERTIES = (b"opacity", b"packed_position")
+"""Properties in the header of a ``.ply`` of splats, and of a compressed one."""
+
 
 @dataclass(frozen=True)
 class Doctor:
@@ -56,13 +60,24 @@ class Doctor:
             for line in lines:
                 print(line)
         except DatasetError as error:
-            inside = [file for file in _files(self.path) if looks_like_splats(file)]
+            inside = [file for file in _files(self.path) if _holds_splats(file)]
             if not inside:
                 raise
             commands = ", ".join(f"rfedge doctor {shlex.quote(str(file))}" for file in inside[:3])
             raise DatasetError(
                 f"{error}; it holds {len(inside)} splat files: {commands}"
             ) from error
+
+
+def _holds_splats(file: Path) -> bool:
+    """Tell whether a file is of splats; a ``.ply`` of points beside a dataset is not."""
+    from rfcore.field.splat_file import looks_like_splats
+
+    if not looks_like_splats(file):
+        return False
+    with file.open("rb") as content:
+        header = content.read(PLY_HEADER_BYTES)
+    return not header.startswith(b"ply") or any(name in header for name in SPLAT_PROPERTIES)
 
 
 def _files(path: Path) -> list[Path]:

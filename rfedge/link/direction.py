@@ -58,6 +58,8 @@ class Direction:
         self._transit = transit
         self._spin_s = spin_s
         self._link = link
+        self._loses = isinstance(link, LossyLink)
+        """Packets that are sent again keep the link busy, too: its accuracy cannot be told."""
         self._arrived = asyncio.Event()
         self._holding = False
 
@@ -123,7 +125,7 @@ class Direction:
             "bytes": meter.wire_bytes,
             "busy_s": meter.busy_s,
             "expected_s": meter.expected_s,
-            "tau_error_percent": meter.tau_error_percent,
+            "tau_error_percent": None if self._loses else meter.tau_error_percent,
             "busy_periods": meter.periods,
             "largest_lateness_s": meter.largest_lateness_s,
         }

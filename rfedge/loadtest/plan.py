@@ -186,12 +186,15 @@ class Utilisation:
 def limit(resources: Resources) -> str:
     """Name the first resource above its limit, or the one nearest to it, with its utilisation.
 
-    Where other programs kept the machine busy, and the test alone would not have, these are named.
+    A link that is full is named before the machine. Where other programs kept the machine busy, and
+    the test alone would not have, these are named.
     """
     r = resources
     machine = Utilisation(
         f"CPU of the machine, at {_percent(r.machine)}{_beside(r)}", r.machine, MACHINE_BUSY
     )
+    if (link := _link(r)).is_over:  # no machine would help
+        return link.text
     if r.others > OTHERS and r.machine > BUSY >= r.test:
         return (
             f"other programs on this machine: they took {r.others:.1f} cores of it, the test "
@@ -217,12 +220,17 @@ def _fullest(uses: Sequence[Utilisation]) -> str:
 
 
 def _on_one_core(r: Resources) -> tuple[Utilisation, ...]:
-    shares = (
-        ("vehicles of the test, at {} of a core", r.generator),
-        ("link of the busiest vehicle, at {}", r.link),
-        ("server's event loop, at {} of a core", r.server_loop),
+    generator = f"vehicles of the test, at {_percent(r.generator)} of a core"
+    loop = f"server's event loop, at {_percent(r.server_loop)} of a core"
+    return (
+        Utilisation(generator, r.generator, BUSY),
+        _link(r),
+        Utilisation(loop, r.server_loop, BUSY),
     )
-    return tuple(Utilisation(text.format(_percent(share)), share, BUSY) for text, share in shares)
+
+
+def _link(r: Resources) -> Utilisation:
+    return Utilisation(f"link of the busiest vehicle, at {_percent(r.link)}", r.link, BUSY)
 
 
 def _workers(r: Resources) -> Utilisation:
@@ -289,6 +297,10 @@ class Verdict:
     """The bounds that were not kept; the load is held if there are none."""
     p50_ms: float
     p99_ms: float
+    due: int
+    """Number of pictures that were due."""
+    answered: int
+    """Number of them that were acknowledged, of which the percentiles are."""
     on_time_percent: float
     on_time_at_least_percent: float
     fairness: float | None
@@ -334,6 +346,8 @@ def judge(measured: Measured, bounds: Bounds) -> Verdict:
         broken=broken,
         p50_ms=p50_ms,
         p99_ms=p99_ms,
+        due=due,
+        answered=len(latency_ms),
         on_time_percent=percent,
         on_time_at_least_percent=100.0 * share_at_least(on_time, due),
         fairness=fairness,

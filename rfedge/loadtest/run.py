@@ -112,6 +112,10 @@ class LoadRow:
     """Threads of a render."""
     run: int | None = None
     """Number of the run, from 1, where a load is repeated."""
+    due: int | None = None
+    """Pictures that were due; None in older results."""
+    answered: int | None = None
+    """Pictures that were acknowledged, of which the percentiles are; None in older results."""
 
 
 @dataclass(frozen=True)
@@ -217,6 +221,8 @@ def _row(
         held=verdict.held,
         p50_ms=_finite(verdict.p50_ms),
         p99_ms=_finite(verdict.p99_ms),
+        due=verdict.due,
+        answered=verdict.answered,
         on_time_percent=verdict.on_time_percent,
         on_time_at_least_percent=verdict.on_time_at_least_percent,
         fairness=verdict.fairness,
@@ -332,11 +338,12 @@ def _outcome(run: Run) -> str:
 
 def print_runs(console: Console, result: LoadResult) -> None:
     """Print a row for each run, and why the smallest load that was not held was not."""
-    columns = ("vehicles", "held", "p50 ms", "p99 ms", "on time %", "server cores")
+    columns = ("vehicles", "held", "answered", "p50 ms", "p99 ms", "on time %", "server cores")
     rows = [
         [
             str(run.load.vehicles),
             "yes" if run.verdict.held else "no",
+            f"{run.verdict.answered} of {run.verdict.due}",
             f"{run.verdict.p50_ms:.1f}",
             f"{run.verdict.p99_ms:.1f}",
             f"{run.verdict.on_time_percent:.2f}",

@@ -363,6 +363,7 @@ class Train:
 
     def _finished(self, job: TrainingJob, trained: Trained, console: Console) -> RadianceField:
         from rfcore.field import SplatField
+        from rfcore.field.integers import TooAlike
         from rfcore.train.levels import LevelFitConfig
         from rfedge.training.finish import finish_field, size_goal
 
@@ -373,7 +374,12 @@ class Train:
         held_out = job.held_out.pictures if job.held_out is not None else ()
         levels = LevelFitConfig(threads=self.threads)
         left_s = trained.left_s if self._kept_s else None
-        return finish_field(field, job.dataset.pictures, held_out, levels, console, goal, left_s)
+        pictures = job.dataset.pictures
+        try:
+            return finish_field(field, pictures, held_out, levels, console, goal, left_s)
+        except TooAlike:  # after a handful of iterations
+            console.print("  its splats are still alike: kept uncompressed, as --plain does")
+            return field
 
 
 def _words(options: Mapping[str, Any]) -> str:

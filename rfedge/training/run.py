@@ -328,10 +328,11 @@ def outcome_of(job: TrainingJob, trained: Trained, field: RadianceField) -> Outc
         problem = f"no better than their mean colour ({mean_db:.2f} dB): of no use"
         was_asked_for = few and job.limits.minutes is None
         return Outcome(f"{text}, {problem}; {remedy}", not was_asked_for)
+    is_rising = trained.iterations < RISING_PASSES * len(shown)
     if psnr_db < FITS_DB:
         problem = f"below {FITS_DB:g} dB commands take it for a field of another place"
-        return Outcome(f"{text}; {problem}; {remedy}", False)
-    if trained.iterations < RISING_PASSES * len(shown):
+        return Outcome(f"{text}; {problem}; {give_more if is_rising else remedy}", False)
+    if is_rising:
         return Outcome(f"{text}; {give_more}", False)
     if job.held_out is None:
         return Outcome(f"{text}; --holdout 8 says how good other views are", False)

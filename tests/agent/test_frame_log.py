@@ -76,16 +76,22 @@ def acked(
     )
 
 
-def test_the_quality_of_a_drive_is_that_of_the_mean_error_of_what_was_shown(metrics, acked):
+def test_a_drive_ends_with_the_mean_errors_quality_and_the_latency_of_what_was_shown(
+    metrics, acked
+):
     """Half of 100 and of 300 is 200: 25.12 dB."""
     observer = DriveObserver(metrics, ADDRESSES)
     assert observer.quality() == {}
     for mse in (100.0, 300.0):
-        shown = replace(acked, encoded=replace(acked.encoded, luma_mse=mse))
+        shown = replace(acked, encoded=replace(acked.encoded, luma_mse=mse), latency_s=mse / 1e3)
         observer.ended(shown)
         observer.ended(replace(shown, outcome=Outcome.LOST))
     observer.ended(replace(acked, outcome=Outcome.LOST))
-    assert observer.quality() == {"psnr_db": 25.12}
+    assert observer.quality() == {
+        "psnr_db": 25.12,
+        "latency_p50_ms": 200.0,
+        "latency_p99_ms": 298.0,
+    }
     assert log_line(shown)["psnr_db"] == 23.36
     assert log_line(acked)["psnr_db"] is None
 

@@ -175,3 +175,40 @@ def test_a_wait_behind_another_packet_is_not_the_paths() -> None:
     path.answered("second", now + 20 * MS + 20_000 * 1000)
     cost = 100 * MS / path.sustained_bytes(100 * MS, now + 40 * MS)
     assert cost == pytest.approx(1000, rel=0.02), "1900 if the wait counted as the path's time"
+
+
+@given(
+    packets=st.lists(
+        st.tuples(st.integers(0, 100), st.integers(200, 20_000)), min_size=1, max_size=15
+    ),
+    ns_per_byte=st.integers(400, 40_000),
+    downloads_ms=st.lists(st.tuples(st.integers(0, 300), st.integers(1, 900)), max_size=4),
+)
+@example(
+    packets=[(0, 7000), (10, 7000), (10, 7000)], ns_per_byte=4000, downloads_ms=[(0, 500)]
+).via("answers that came together proved 61 Tbit/s")
+def test_answers_that_wait_behind_downloads_prove_no_more_than_the_path_has(
+    packets: list[tuple[int, int]], ns_per_byte: int, downloads_ms: list[tuple[int, int]]
+) -> None:
+    """An answer that would come while something is downloaded comes at the download's end."""
+    spans, free_ms = [], 0
+    for gap_ms, length_ms in downloads_ms:
+        spans.append(((free_ms + gap_ms) * MS, (free_ms + gap_ms + length_ms) * MS))
+        free_ms += gap_ms + length_ms + 1
+
+    def own_wait_ns(since_ns: int, until_ns: int) -> int:
+        return sum(max(0, min(until_ns, end) - max(since_ns, start)) for start, end in spans)
+
+    path, sent_ns, delivered_ns = PathEstimator(own_wait_ns), 0, 0
+    events = []
+    for key, (gap_ms, size_bytes) in enumerate(packets):
+        sent_ns += gap_ms * MS
+        delivered_ns = max(delivered_ns, sent_ns) + ns_per_byte * size_bytes
+        held = [end for start, end in spans if start <= delivered_ns < end]
+        events += [(sent_ns, 0, key), (max([delivered_ns, *held]), 1, key)]
+    for now_ns, is_answer, key in sorted(events):
+        if is_answer:
+            path.answered(key, now_ns)
+        else:
+            path.sent(key, packets[key][1], now_ns)
+    assert (path.rate_bps or 0.0) <= 8e9 / ns_per_byte * (1 + 1e-6)

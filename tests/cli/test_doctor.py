@@ -87,6 +87,7 @@ def test_what_cannot_be_read_is_an_error_with_what_to_do(tmp_path):
     (tmp_path / "pictures").mkdir()
     write_png(tmp_path / "pictures" / "a.png", np.zeros((4, 4, 3), np.uint8))
     (tmp_path / "scene.sog").write_bytes(b"PK\x03\x04" + bytes(26) + b"means_l.webp")
+    (tmp_path / "points.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
     write_mp4(tmp_path / "video.mp4", [np.zeros((16, 16, 3), np.uint8)] * 2, 10.0)
     for name, error, said in (
         ("pictures", DatasetError, "rfedge dataset poses"),

@@ -243,9 +243,11 @@ def test_a_watcher_prints_what_was_sent_and_waits_for_a_picture_once_it_is_conne
     monkeypatch.setattr(module, "waiting", waiting)
     module.watch(WatchSettings(), OnePicture())
     assert waited == ["a connection", "a picture", "another picture"]
-    out = capsys.readouterr().out
+    out, said = capsys.readouterr()
     assert "4200 bytes" in out
     assert "345600" not in out
+    age_ms = round(grey(1).age_ns / 1e6)
+    assert f"1 pictures, 0 missed; age p50 {age_ms}, p95 {age_ms}, p99 {age_ms} ms" in said
 
 
 @contextmanager

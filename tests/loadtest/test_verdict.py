@@ -68,6 +68,7 @@ def test_pictures_that_never_came_count_against_the_share():
     verdict = judge(run_of(VehicleReport(100, [5.0] * 90)), Bounds())
     assert verdict.on_time_percent == 90.0
     assert verdict.p99_ms == 5.0, "of those acknowledged"
+    assert (verdict.answered, verdict.due) == (90, 100)
 
 
 def test_what_others_use_is_the_limit_only_where_a_bound_was_broken():
@@ -103,6 +104,10 @@ def test_where_there_is_nothing_to_compare_there_is_no_fairness(vehicles):
         (
             {"machine": 0.93, "others": 1.2, "test": 0.4, "workers": 0.9},
             "other programs on this machine: they took 1.2 cores of it, the test 40 % of all",
+        ),
+        (
+            {"link": 1.0, "machine": 0.93, "others": 1.2, "test": 0.4},
+            "link of the busiest vehicle, at 100 %",
         ),
         ({"generator": 0.9, "server_loop": 0.98}, "vehicles of the test, at 90 % of a core"),
         ({"generator_lag_ms": 25.0}, "vehicles of the test, 25 ms late themselves"),
