@@ -12,6 +12,7 @@ from lab.pages.savings import signed_span, span
 from lab.pages.summary import comparisons
 from lab.pages.summary import finding as compare_finding
 from lab.paper.report import paper_rows, savings_by_frame
+from lab.webrtc.report import finding as webrtc_finding
 from rfedge.demo.report import figures_of
 from rfedge.results import Result
 from rfedge.sizing.estimate import Demand, estimate
@@ -38,6 +39,10 @@ def _all(named: Named, key: str = "rows") -> list[Row]:
 
 def _held(rows: Sequence[Row], what: str, key: str = "held") -> str:
     return f"{sum(bool(row[key]) for row in rows)} of {len(rows)} {what} hold."
+
+
+def _webrtc(named: Named) -> str:
+    return webrtc_finding(named[0][1])
 
 
 def _compare(named: Named) -> str:
@@ -344,6 +349,7 @@ FINDINGS: Mapping[str, Callable[[Named], str]] = {
     "latency": _latency,
     "robust": _robust,
     "tcp": _tcp,
+    "webrtc": _webrtc,
     "localise": _localise,
     "sizing": _sizing,
     "loadtest": _loadtest,

@@ -121,6 +121,13 @@ def webrtc_parts(result: Result) -> Iterator[Table | str]:
     yield Table("At equal quality, peer / ours", PAIR, pairs)
 
 
+def finding(result: Result) -> str:
+    """Return who was better of us and the first peer, in a sentence."""
+    pairs = paired(rows_of(WebrtcRow, result["rows"]))
+    name = pairs[0].peer.peer
+    return told(name, [pair for pair in pairs if pair.peer.peer == name])
+
+
 def told(name: str, pairs: Sequence[Pair]) -> str:
     """Return who was better, in a sentence."""
     equal = [pair for pair in pairs if pair.is_equal]
@@ -129,9 +136,10 @@ def told(name: str, pairs: Sequence[Pair]) -> str:
         f"{shares[0]:.0f} to {shares[-1]:.0f} % of its bytes" if shares else "no figure of bytes"
     )
     half = sum(each <= 50 for each in shares)
+    no_later = sum(pair.is_no_later for pair in pairs)
     return (
-        f"**{name}**, {len(pairs)} links: its quality reached in {len(equal)}, there with {share}, "
-        f"at most half in {half}; p99 no higher in {sum(pair.is_no_later for pair in pairs)}, "
+        f"Beside {name} on {len(pairs)} links: its quality reached in {len(equal)}, there with "
+        f"{share}, at most half in {half}; p99 no higher in {no_later}, "
         f"frozen no longer in {sum(pair.is_no_more_frozen for pair in pairs)}."
     )
 

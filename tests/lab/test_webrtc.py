@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.pages.findings import FINDINGS
 from lab.tcp.wire import SteppedRate
 from lab.webrtc.bed import numbers_at, numbers_of
 from lab.webrtc.camera import CameraPictures, captured, there_and_back
@@ -225,7 +226,8 @@ def test_the_page_says_who_was_better():
     }  # fmt: skip
     parts = webrtc_parts(json.loads(json.dumps(result)))
     page = "\n".join(part if isinstance(part, str) else part.markdown() for part in parts)
-    assert "**libwebrtc-av1**, 2 links" in page
+    assert FINDINGS["webrtc"]([("webrtc", result)]) in page
+    assert "Beside libwebrtc-av1 on 2 links" in page
     assert "at most half in 2; p99 no higher in 1" in page
     assert "1, then 0.5" in page
 
