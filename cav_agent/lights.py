@@ -125,7 +125,7 @@ class TileLights:
                     "own field taken",
                     field=own.field_id,
                     detail=own.most_detail,
-                    instead_of=before.field_id,
+                    detail_before=before.most_detail,
                 )
             return self.current
 

@@ -17,6 +17,9 @@ from rfedge.arguments import is_field_file, open_field
 if TYPE_CHECKING:
     from rfcore.dataset.source import Source
 
+EASY_SIDE_PX, LEAST_REDUCED = 1280, 0.8
+"""Longest side of pictures that are trained on in minutes, and the scale from which to leave them.
+"""
 PLY_HEADER_BYTES = 8192
 SPLAT_PROPERTIES = (b"opacity", b"packed_position")
 """Properties in the header of a ``.ply`` of splats, and of a compressed one."""
@@ -178,13 +181,24 @@ def _of_dataset(path: Path) -> Iterator[str]:
         yield f"{source.sorted_out} pictures are listed but not there, and left out"
     yield from dataset.changes
     source.pictures[0].read()
-    quoted = shlex.quote(str(path))
+    given = shlex.quote(str(path)) + _smaller(source)
     for feed in source.feeds:
         yield f"{feed}: a pose feed, which `rfedge dataset convert` writes beside the pictures"
     if any(picture.camera.lens is not None for picture in source.pictures):
-        yield f"next: rfedge dataset convert {quoted} --out DATASET (without the lens)"
+        yield f"next: rfedge dataset convert {given} --out DATASET (without the lens)"
     else:
-        yield f"next: rfedge train {quoted} --out FIELD.rff"
+        yield f"next: rfedge train {given} --out FIELD.rff"
+
+
+def _smaller(source: Source) -> str:
+    """Return ``--size`` where pictures have far more pixels than minutes of training are for."""
+    shown = (picture.camera.intrinsics for picture in source.pictures)
+    sizes = {(k.width_px, k.height_px) for k in shown}
+    width_px, height_px = next(iter(sizes))
+    scale = EASY_SIDE_PX / max(width_px, height_px)
+    if len(sizes) > 1 or scale >= LEAST_REDUCED:
+        return ""
+    return f" --size {round(scale * width_px)}x{round(scale * height_px)}"
 
 
 def _cameras(source: Source) -> Iterator[str]:

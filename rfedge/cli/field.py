@@ -95,6 +95,8 @@ class FieldImport:
         up_line = up_of_file(read.up) if self.up is None else f"up: {self.up}, as --up states"
         for note in (*read.notes, up_line, self._mode_line(read.antialiased)):
             print(note)
+        if not self.raw:
+            print("compressed, which moves every number a little: --raw keeps them")
         print_levels(Console(), field, look_around(field, 1280, 720))
 
     def _mode_line(self, stated: bool | None) -> str:

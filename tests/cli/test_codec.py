@@ -165,7 +165,7 @@ def test_without_bubblewrap_decode_says_so_in_one_line(monkeypatch, capfd):
     Decode(Path("a.rfv"), Path("street.rff"), Path("film/a.mp4")).run()
     said = capfd.readouterr()
     sandbox, film = said.out.splitlines()
-    assert sandbox.startswith("decoded in a landlock sandbox: ")
+    assert sandbox.startswith("note: decoded in a landlock sandbox (")
     assert "install bubblewrap" in sandbox
     assert film == "film/a.mp4: 4 frames at 10 Hz"
     assert said.err == ""

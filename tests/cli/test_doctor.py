@@ -1,5 +1,6 @@
 """``rfedge doctor`` says what a thing is, what is understood and left out, and what is next."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -81,6 +82,19 @@ def test_what_is_next_for_a_lens_is_to_take_it_out(tmp_path, capsys):
     words = shlex.split(re.search(r"^next: rfedge (.*) \(", said, re.MULTILINE)[1])
     parse([*words[:-1], str(tmp_path / "plain")]).run()
     assert "PINHOLE" in told(tmp_path / "plain", capsys)
+
+
+def test_large_pictures_are_made_smaller_by_the_next_command(tmp_path, capsys):
+    """A portrait picture's longest side is its height."""
+    write_png(tmp_path / "a.png", np.zeros((1600, 200, 3), np.uint8))
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    content = {"w": 200, "h": 1600, "fl_x": 900, "fl_y": 900, "cx": 100, "cy": 800, "k1": 0.001}
+    (tmp_path / "transforms.json").write_text(json.dumps(content | {"frames": [frame]}))
+    said = told(tmp_path, capsys)
+    words = shlex.split(re.search(r"^next: rfedge (.*) \(without", said, re.MULTILINE)[1])
+    parse([str(tmp_path / "out") if word == "DATASET" else word for word in words]).run()
+    height_px = int(re.search(r"^1 of \d+x(\d+) px", told(tmp_path / "out", capsys), re.M)[1])
+    assert 1200 < height_px <= 1280
 
 
 def test_what_cannot_be_read_is_an_error_with_what_to_do(tmp_path):
