@@ -86,9 +86,9 @@ def test_what_is_next_for_a_lens_is_to_take_it_out(tmp_path, capsys):
 
 def test_large_pictures_are_made_smaller_by_the_next_command(tmp_path, capsys):
     """A portrait picture's longest side is its height."""
-    write_png(tmp_path / "a.png", np.zeros((1600, 200, 3), np.uint8))
+    write_png(tmp_path / "a.png", np.zeros((1700, 200, 3), np.uint8))
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
-    content = {"w": 200, "h": 1600, "fl_x": 900, "fl_y": 900, "cx": 100, "cy": 800, "k1": 0.001}
+    content = {"w": 200, "h": 1700, "fl_x": 900, "fl_y": 900, "cx": 100, "cy": 850, "k1": 0.001}
     (tmp_path / "transforms.json").write_text(json.dumps(content | {"frames": [frame]}))
     said = told(tmp_path, capsys)
     words = shlex.split(re.search(r"^next: rfedge (.*) \(without", said, re.MULTILINE)[1])
