@@ -139,7 +139,7 @@ def with_headline(page: str, results: Recorded) -> str:
     if not (mark and end):
         raise InvalidInput("page", f"it lacks {README_BEGINS!r} ... {README_ENDS!r}")
     named = dict(results["compare"])
-    told = headline(named["compare"], named["compare-harder"])
+    told = headline(named["compare"], named["compare-harder"], named.get("compare-size"))
     return f"{before}{mark}\n\n{told}\n\n{end}{after}"
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -33,6 +35,7 @@ from rfedge.sizing.tables import shipped_tables
 README_DRIVES = ("sample-empty", "sample-vehicles", "kitti-loop")
 README_LOSS = "sample-rain"
 README_SIZES = ((640, 360, 10.0), (1280, 720, 15.0), (1920, 1080, 30.0))
+SIZE = re.compile(r"\d+x\d+")
 README_FIGURE = "lab/results/figures/bd_rates.svg"
 SUMMARY_COLUMNS = (
     "drive",
@@ -46,10 +49,11 @@ SUMMARY_COLUMNS = (
 )
 
 
-def headline(compared: Result, harder: Result) -> str:
+def headline(compared: Result, harder: Result, sized: Result | None = None) -> str:
     """Return the README's sentence with its loss, and a row for each of three drives.
 
-    Raises ``InvalidInput`` for a comparison that lacks one of them.
+    ``sized``: larger pictures with fields of their own. Raises ``InvalidInput`` for a comparison
+    that lacks one of them.
     """
     rows, lossy = (of_first_window(rows_of(CompareRow, r["rows"])) for r in (compared, harder))
     fair = [_against(rows, scene) for scene in README_DRIVES]
@@ -73,7 +77,26 @@ def headline(compared: Result, harder: Result) -> str:
         )
     heads = ("drive", "bits against x264 with our tools (95 %)", "against the best of all rivals")
     table = text_table(heads, lines).markdown()
-    return f"{sentence}\n{_larger()}\n\n{table}\n\n![bits saved]({README_FIGURE})"
+    return (
+        f"{sentence}\n{_of_own_size(sized)}{_larger()}\n\n{table}\n\n![bits saved]({README_FIGURE})"
+    )
+
+
+def _of_own_size(sized: Result | None) -> str:
+    """Return what is saved on larger pictures, each size with the field that stands first."""
+    if sized is None:
+        return ""
+    rows = of_first_window(rows_of(CompareRow, sized["rows"]))
+    saved = defaultdict[str, dict[str, float]](dict)
+    for row in rows:
+        drive, _, size = row.scene.rpartition("-")
+        if SIZE.fullmatch(size) and (row.rival, _bare(row.method)) == (HEADLINE_ANCHOR, "rfedge"):
+            saved[size].setdefault(drive, -row.bd_rate_percent)
+    told = [
+        f"{min(drives.values()):.0f} to {max(drives.values()):.0f} % at {size}"
+        for size, drives in saved.items()
+    ]
+    return f"Larger pictures want a field trained on such: {', '.join(told)}. " if told else ""
 
 
 def _larger() -> str:
@@ -85,7 +108,7 @@ def _larger() -> str:
         saved_percent = 100 * (1 - mbps["rfedge"] / mbps["x264"])
         told.append(f"{saved_percent:.0f} % at {width_px}x{height_px} and {hz:g} Hz")
     return (
-        "Larger pictures and faster cameras save less: on the sample street "
+        "With the sample's, of 640x360 pictures, larger ones and faster cameras save less: "
         f"[`rfedge size`](docs/how-to/sizing.md) says {', '.join(told)}."
     )
 

@@ -27,7 +27,7 @@ SAMPLE_SIZE = "640x360"
 """Size of the drives in ``samples/street``, whose names do not say it."""
 SIZED = re.compile(r"(sample-(?:empty|vehicles))(?:-(\d+x\d+))?")
 WEAKEST = 3
-"""Drives of ``compare-harder`` in the table: those that save least against the strongest rival."""
+"""Drives of ``HARDER`` in the table: those that save least against the strongest rival."""
 X264, STRONGEST = "x264 with our tools", "strongest rival"
 FIGURES = {
     "first-drives": "Bits by drive, 32 to 35 dB",
@@ -45,8 +45,10 @@ receiver a frame: ours / that x264 / the strongest, on a shared machine: compare
 alone. *MB* is the field, sent once; *drives until paid* says after how many such drives it is. The
 last rows of the table are drives that save least: [where it loses](losses.md)."""
 
-FILES = ("compare", "compare-harder", "compare-size")
+FILES = ("compare", "compare-harder", "compare-noise", "compare-size")
 """Comparisons with the fields that are meant to be used; ``compare-small`` tries smaller ones."""
+
+HARDER = ("compare-harder", "compare-noise")
 
 Named = Mapping[str, Result]
 """Comparisons by the names of their files."""
@@ -126,8 +128,8 @@ def larger_sizes(compared: Named) -> list[DriveSavings]:
 
 
 def weakest(compared: Named) -> list[DriveSavings]:
-    """Return the drives of ``compare-harder``, the least saving against the strongest first."""
-    harder = savings_of(compared["compare-harder"])
+    """Return the drives of ``HARDER``, the least saving against the strongest first."""
+    harder = [each for name in HARDER if name in compared for each in savings_of(compared[name])]
     return sorted(harder, key=lambda each: -each.best.bd_rate_percent)
 
 
