@@ -352,7 +352,7 @@ def _notes(frame: av.VideoFrame, orientation: Orientation) -> list[str]:
     if orientation is not Orientation.UPRIGHT:
         notes.append(f"frames are {orientation.words}, as the file says")
     if (said := treatment(frame)) is not None:
-        white = "; white is 203 cd/m2, and what is brighter" if said in HDR.values() else ""
+        white = "; 203 cd/m2 and more is white" if said in HDR.values() else ""
         notes.append(f"{said} becomes BT.709{white}")
     if has_alpha(frame.format):
         notes.append("frames have an alpha channel: they are composed over black")

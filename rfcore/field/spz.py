@@ -350,7 +350,8 @@ def _with_ply_axes(stored: StoredSplats, extensions: dict[int, bytes]) -> Stored
     if not content or number == 0:
         said = (
             "axes: the file states none, so they are taken as those of a .ply; some tools turn "
-            "them half round x (`rfedge field check NAME --drive DATASET` finds out)"
+            "them half round x (`rfedge field check NAME --drive DATASET --fix FILE.rff` turns "
+            "them back)"
         )
         return replace(stored, notes=(said, *notes))
     if number > len(SYSTEMS):
