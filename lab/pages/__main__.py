@@ -35,6 +35,7 @@ from lab.robust.report import REPORT as ROBUST
 from lab.servers.cases import SCALE, WORLD
 from lab.soak import REPORT as SOAK
 from lab.tcp.run import REPORT as TCP
+from lab.truth.run import REPORT as LIVE_TRUTH
 from lab.webrtc.report import REPORT as WEBRTC
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
@@ -51,7 +52,8 @@ KINDS: Mapping[str, Report] = {
         *REPORTS[:4],
         *(PAPER, BENCHMARK, CLASSES, DETECT, ADAPT, HEAD, LATENCY, ROBUST, TCP, LOCALISE, SIZING),
         WEBRTC,
-        *(LOADS, RATIO, RIG, LIVE, COLD_START, WORLD, SCALE, FAULTS, ATTACKS, STABILITY, SOAK),
+        *(LOADS, RATIO, RIG, LIVE, LIVE_TRUTH, COLD_START, WORLD, SCALE),
+        *(FAULTS, ATTACKS, STABILITY, SOAK),
         *REPORTS[4:],
     )
 }

@@ -86,7 +86,8 @@ def truth_parts(result: Result) -> Iterator[Table | str]:
         "A picture is wrong if it is none of those that were sent, bit for bit; one that shows two "
         "instants counts as wrong. A source gives none in the first half second, in which FFmpeg "
         "finds out what comes. A dash is nothing stated, or nothing to state. "
-        f"The machine's load was {low:.1f} to {high:.1f} on {result['host']['cores']} cores."
+        f"The machine's load was {low:.1f} to {high:.1f} on {result['host']['cores']} cores"
+        + (", so that delays are mostly of the load." if high > result["host"]["cores"] else ".")
     )
     cameras = [row for row in rows if row.pictures is not None]
     if cameras:
