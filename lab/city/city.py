@@ -65,7 +65,7 @@ Floats = NDArray[np.float64]
 
 MAX_CELLS = 20_000
 TABLES_MOVING_PERCENT = 18.7
-EMPTY_STREET_SHARE = 1321 / 2823
+EMPTY_STREET_SHARE = 1205 / 2691
 """Bytes of a frame at 34 dB, 10 Hz and 640x360, where everything that is seen is in the field, over
 those where 18.7 % of the area is not: the rows ``curves`` and ``bits`` of lab/results/compare.json
 for the sample street without and with vehicles. Between and beyond the two a straight
