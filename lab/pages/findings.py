@@ -41,6 +41,14 @@ def _held(rows: Sequence[Row], what: str, key: str = "held") -> str:
     return f"{sum(bool(row[key]) for row in rows)} of {len(rows)} {what} hold."
 
 
+def _live_truth(named: Named) -> str:
+    rows = [row for row in _all(named) if row["pictures"] is not None]
+    before = [row["before"] for row in rows if row["before"]]
+    wrong = [sum(row.get("wrong_pictures") or 0 for row in of) for of in (rows, before)]
+    then = f", where the revision before gave {wrong[1]}" if before else ""
+    return f"{wrong[0]} wrong pictures are handed on in {len(rows)} cases{then}."
+
+
 def _webrtc(named: Named) -> str:
     return webrtc_finding(named[0][1])
 
@@ -356,6 +364,7 @@ FINDINGS: Mapping[str, Callable[[Named], str]] = {
     "load-ratio": _load_ratio,
     "rig": _rig,
     "live": _live,
+    "live-truth": _live_truth,
     "cold-start": _cold_start,
     "world": _bounds,
     "scale": _bounds,
