@@ -42,8 +42,8 @@ def _held(rows: Sequence[Row], what: str, key: str = "held") -> str:
 
 
 def _live_truth(named: Named) -> str:
-    rows = [row for row in _all(named) if row["pictures"] is not None]
-    before = [row["before"] for row in rows if row["before"]]
+    rows = [row for row in _all(named) if "pictures" in row]
+    before = [row["before"] for row in rows if "before" in row]
     wrong = [sum(row.get("wrong_pictures") or 0 for row in of) for of in (rows, before)]
     then = f", where the revision before gave {wrong[1]}" if before else ""
     return f"{wrong[0]} wrong pictures are handed on in {len(rows)} cases{then}."
