@@ -7,9 +7,10 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from rfcore.field import FULL, Quality, render_field_view
+from rfcore.field import FULL, Quality, SplatField, render_field_view
 from rfcore.native.yuv import i420_from_colour
 from rfcore.views import View, confidence
+from tests.field.some import make_gaussians
 
 SIZE_PX = (10, 6)
 CAMERA = Camera(
@@ -49,6 +50,29 @@ def test_the_renderer_is_asked_for_the_camera_and_quality_given():
     render_field_view(wall, CAMERA)
     render_field_view(wall, CAMERA, half)
     assert wall.asked == [(CAMERA, FULL), (CAMERA, half)]
+
+
+class Darker:
+    """A proxy that overrides the documented method and forwards everything else."""
+
+    def __init__(self, renderer: object) -> None:
+        self._renderer = renderer
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._renderer, name)
+
+    def render(self, camera: Camera, quality: Quality = FULL) -> View:
+        view = self._renderer.render(camera, quality)
+        return replace(view, colour=view.colour / 2)
+
+
+def test_a_proxy_that_renders_otherwise_is_what_is_used():
+    """Splats have a quicker way than ``render``, which the proxy forwards, too."""
+    field = SplatField(make_gaussians(500, 1))
+    camera = Camera(Intrinsics(32, 32, 16.0, 16.0, 16.0, 16.0), Pose((0, 0, -3), (1, 0, 0, 0)))
+    shown = render_field_view(Darker(field), camera).render
+    half = i420_from_colour(field.render(camera, FULL).colour / 2)
+    assert shown.digest() == half.digest() != render_field_view(field, camera).render.digest()
 
 
 def test_a_view_covers_what_is_more_opaque_than_asked():

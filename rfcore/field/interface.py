@@ -199,7 +199,9 @@ def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FUL
     >>> view.render.size_px
     (64, 36)
     """
-    if isinstance(renderer, CodecPictureRenderer):
+    # Of its class: a proxy that changes ``render`` and forwards the rest must not be passed by.
+    has_field_view = hasattr(type(renderer), "field_view")
+    if has_field_view and isinstance(renderer, CodecPictureRenderer):
         return renderer.field_view(camera, quality)
     return field_view_from_view(renderer.render(camera, quality), camera)
 
