@@ -226,7 +226,9 @@ def measured(load: Load, run: RunMeasurements, link_busy: float, workers: int) -
     )
     wanted = len(admitted) if load.admission else load.vehicles
     settled = server.after(max(0.0, SETTLING_S - load.warm_up_s))
-    return Measured(admitted, wanted, settled.growth_mb, settled.minutes, resources)
+    return Measured(
+        admitted, wanted, settled.growth_mb, settled.minutes, resources, 1e3 * link_busy / load.hz
+    )
 
 
 def links_busy(report: Path, load: Load) -> float:

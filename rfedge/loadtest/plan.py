@@ -287,6 +287,8 @@ class Measured:
     """Growth of the server's memory over the last ``minutes``; None if it had no time to settle."""
     minutes: float
     resources: Resources
+    instant_ms: float = 0.0
+    """Mean time that the uplink transmits the pictures of one instant; 0 without a link."""
 
 
 @dataclass(frozen=True)
@@ -351,8 +353,18 @@ def judge(measured: Measured, bounds: Bounds) -> Verdict:
         on_time_percent=percent,
         on_time_at_least_percent=100.0 * share_at_least(on_time, due),
         fairness=fairness,
-        limited_by=(limit if broken else nearest)(measured.resources),
+        limited_by=_limited_by(measured, bounds) if broken else nearest(measured.resources),
     )
+
+
+def _limited_by(measured: Measured, bounds: Bounds) -> str:
+    """Name what kept a load from being held; no machine makes up for a link that is too slow."""
+    if measured.instant_ms > bounds.deadline_ms:
+        return (
+            f"link of the busiest vehicle: an instant's pictures take {measured.instant_ms:.0f} ms "
+            "of it"
+        )
+    return limit(measured.resources)
 
 
 def share_at_least(successes: int, trials: int) -> float:

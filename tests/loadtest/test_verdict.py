@@ -80,6 +80,15 @@ def test_what_others_use_is_the_limit_only_where_a_bound_was_broken():
     assert judge(broken, Bounds()).limited_by == said
 
 
+def test_a_link_that_is_too_slow_for_an_instant_is_the_limit_whatever_the_machine_does():
+    """Four pictures of 7383 bytes take 118 ms of 2 Mbit/s, though the link is not full at 5 Hz."""
+    busy = replace(IDLE, machine=1.0, test=0.3, others=1.4, link=0.59)
+    late = replace(run_of(vehicle(40)), resources=busy, instant_ms=118.0)
+    said = "link of the busiest vehicle: an instant's pictures take 118 ms of it"
+    assert judge(late, Bounds()).limited_by == said
+    assert "other programs" in judge(late, Bounds(deadline_ms=150.0)).limited_by
+
+
 @pytest.mark.parametrize("vehicles", [[vehicle(0), vehicle(0)], [vehicle(40)], []])
 def test_where_there_is_nothing_to_compare_there_is_no_fairness(vehicles):
     verdict = judge(run_of(*vehicles), Bounds())
