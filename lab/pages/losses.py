@@ -69,15 +69,20 @@ def finding(compared: Named) -> str:
         for each in savings_of(compared[name])
         if (row := each.against(BEST_OF_ANY_CPU, HIGH)) is not None
     ]
-    return (
+    change = worst.best.bd_rate_percent
+    told = (
         f"Of {len(harder)} harder drives the strongest rival wins {len(lost)} at 32 to 35 dB, "
-        f"{worst.name} with {worst.best.bd_rate_percent:+.0f} %; at 35 to 38 dB it wins "
-        f"{sum(value > 0 for value in high)} of all {len(high)}."
+        f"{worst.name} with {change:+.0f} %"
+        if lost
+        else f"On none of {len(harder)} harder drives does the strongest rival send fewer bits at "
+        f"32 to 35 dB; least is saved on {worst.name}, {-change:.0f} %"
     )
+    wins = sum(value > 0 for value in high)
+    return f"{told}; at 35 to 38 dB it wins {wins} of all {len(high)}."
 
 
 def _rain(harder: Sequence[DriveSavings]) -> Iterator[str | Table]:
-    wet = [each for each in harder if "rain" in each.scene]
+    wet = [each for each in harder if "rain" in each.scene and each.best.bd_rate_percent > 0]
     if not wet:
         return
     yield "## Rain"
