@@ -407,6 +407,7 @@ def collect(folder: Path = BUILD) -> None:
 def on_site(text: str) -> str:
     """Return a page whose links out of ``docs`` lead to where the site has those pages."""
     text = re.sub(r"\]\((\.\./)+lab/results/", "](../results/", text)
+    text = re.sub(r"\]\((\.\./)+docs/", "](../", text)
     text = re.sub(r"\]\((\.\./)+streetgen/README\.md", "](../reference/streets.md", text)
     return text.replace("<details>", '<details markdown="1">')
 
