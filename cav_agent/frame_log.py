@@ -51,6 +51,8 @@ _REMEDIES: dict[str, str] = {
 """Remedies when no picture was acknowledged, by the reason of most; for other reasons a server
 refused them."""
 
+LATENCIES = 10_000
+"""Pictures whose latencies are kept: more would grow for as long as the vehicle drives."""
 JUDGED_FRAMES = 8
 """Answers of which the median time says whether the processors can keep the delay."""
 
@@ -128,7 +130,7 @@ class DriveObserver:
         self._frame_log = frame_log
         self._unacknowledged: Counter[tuple[str, str]] = Counter()
         self._problem = ""
-        self._latency_ms: list[float] = []
+        self._latency_ms: deque[float] = deque(maxlen=LATENCIES)
         self._logged_crf: float | None = None
         self._pose_state: LocalisationState | None = None
         self._feed_offset_s: float | None = None
@@ -150,13 +152,13 @@ class DriveObserver:
             self._delay_watch.acked(result)
 
     def quality(self) -> dict[str, float]:
-        """Return the luma PSNR of the mean squared error of all acknowledged pictures, and the
-        percentiles of their time from capture to Ack, if any."""
+        """Return the luma PSNR of the mean squared error of all acknowledged pictures, and
+        percentiles of the time from capture to Ack of the last ``LATENCIES``, if any."""
         if not self._luma_mse_sum:
             return {}
         p50_ms, p99_ms = np.percentile(self._latency_ms, (50, 99))
         return {
-            "psnr_db": round(_psnr_db(self._luma_mse_sum / self._measured), 2),
+            "psnr_db": _psnr_db(self._luma_mse_sum / self._measured),
             "latency_p50_ms": round(float(p50_ms), 1),
             "latency_p99_ms": round(float(p99_ms), 1),
         }

@@ -23,7 +23,7 @@ CLASSES = (
     *("sky", "road", "marking", "pavement", "building", "window", "vegetation"),
     *("vehicle", "sign", "pole", "wire", "object", "person", "bicycle"),
 )
-"""What the numbers of ``classes`` mean."""
+"""Names of the numbers in ``classes``."""
 
 
 @dataclass(frozen=True, eq=False)

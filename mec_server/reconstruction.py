@@ -27,7 +27,7 @@ from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.prediction import Prediction
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason, RfedgeError
-from rfcore.field import CodecPictureRenderer, Quality, Renderer
+from rfcore.field import Quality, Renderer, codec_renderer
 from rfcore.image import I420
 from rfcore.native.yuv import field_view_from_view
 from rfcore.views import FieldView, View
@@ -178,8 +178,9 @@ class CameraDecoder:
             return None, FieldView.nothing(self._camera.intrinsics)
         renderer = self._renderers[place.field_id]
         try:
-            if isinstance(renderer, CodecPictureRenderer) and renderer.is_on_device:
-                return None, renderer.field_view(camera, quality)
+            quicker = codec_renderer(renderer)
+            if quicker is not None and quicker.is_on_device:
+                return None, quicker.field_view(camera, quality)
             render = renderer.render(camera, quality)
             return render, field_view_from_view(render, camera)
         except InvalidInput as error:

@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, wait
 from contextlib import ExitStack, closing, contextmanager
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
     from rfedge.cpm import CpmFile
     from rfedge.mcap_file import McapFile
 
+AGES = 10_000
+"""Pictures whose ages are kept: more would grow for as long as somebody watches."""
 TICKS_PER_S = 90_000
 """Resolution of a video's times, as in MPEG systems."""
 
@@ -208,14 +211,15 @@ class WatchSettings:
 
 
 class Summary:
-    """Counts pictures and keeps their ages, for one line at the end."""
+    """Counts pictures and keeps the last ones' ages, for one line at the end."""
 
     def __init__(self) -> None:
-        self._age_ms: list[float] = []
-        self._missed = 0
+        self._pictures = self._missed = 0
+        self._age_ms: deque[float] = deque(maxlen=AGES)
 
     def add(self, picture: TwinPicture) -> None:
         """Count a picture, and those missed before it."""
+        self._pictures += 1
         self._age_ms.append(picture.age_ns / 1e6)
         self._missed += picture.skipped
 
@@ -224,7 +228,7 @@ class Summary:
         if self._age_ms:
             p50, p95, p99 = np.percentile(self._age_ms, (50, 95, 99))
             _say(
-                f"{len(self._age_ms)} pictures, {self._missed} missed; "
+                f"{self._pictures} pictures, {self._missed} missed; "
                 f"age p50 {p50:.0f}, p95 {p95:.0f}, p99 {p99:.0f} ms"
             )
 

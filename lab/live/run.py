@@ -24,6 +24,7 @@ from lab.live.report import AgeRow, IngestRow, SourceRow, live_parts
 from lab.live.showing import PictureAges, TwinBed, agent, measure_age, measure_ingest
 from lab.servers.fleet import Lines, read_lines
 from lab.soak import slope_per_minute
+from lab.truth.stream import SDP
 from lab.twin_reader import reading
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable, RfedgeError
@@ -36,14 +37,6 @@ from rfedge.results import CHECKOUT, make_result, provenance, write_result
 SENDER = CHECKOUT / "deploy/live/gst_sender.py"
 """Runs under the system's Python, which has GStreamer's bindings; it is no part of the package."""
 SYSTEM_PYTHON = "/usr/bin/python3"
-SDP = """v=0
-o=- 0 0 IN IP4 127.0.0.1
-s=camera
-c=IN IP4 127.0.0.1
-t=0 0
-m=video {port} RTP/AVP 96
-a=rtpmap:96 H264/90000
-"""
 DOWN_S = 3.0
 """Time for which a killed sender stays away: longer than the agent takes to call its source
 lost."""

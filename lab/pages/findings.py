@@ -9,14 +9,13 @@ from typing import Any
 from lab.bench import flattened
 from lab.pages.losses import fetched_s
 from lab.pages.savings import signed_span, span
+from lab.pages.sizing import BAR_DB, told_cameras
 from lab.pages.summary import comparisons
 from lab.pages.summary import finding as compare_finding
 from lab.paper.report import paper_rows, savings_by_frame
 from lab.webrtc.report import finding as webrtc_finding
 from rfedge.demo.report import figures_of
 from rfedge.results import Result
-from rfedge.sizing.estimate import Demand, estimate
-from rfedge.sizing.tables import shipped_tables
 
 Named = Sequence[tuple[str, Result]]
 """The results of one kind, each with its file's name."""
@@ -28,9 +27,6 @@ PUBLISHED_PERCENT = {
     ("ingp", "parked"): "28 to 68",
 }
 """Savings that arXiv 2402.14642 reports, by field and scene."""
-SIZES = ((640, 360, 10.0), (1280, 720, 15.0), (1920, 1080, 30.0))
-"""Pictures and rates that ``rfedge size`` is asked about, and the quality, dB."""
-SIZE_DB = 34.0
 
 
 def _all(named: Named, key: str = "rows") -> list[Row]:
@@ -212,14 +208,11 @@ def _localise(named: Named) -> str:
 
 
 def _sizing(_: Named) -> str:
-    told = []
-    for width_px, height_px, hz in SIZES:
-        demand = Demand(1, width_px, height_px, hz, SIZE_DB)
-        mbps = {row.codec: row.mbps for row in estimate(demand, shipped_tables()).estimates}
-        told.append(
-            f"{mbps['rfedge']:.2f} against {mbps['x264']:.2f} at {width_px}x{height_px}, {hz:g} Hz"
-        )
-    return f"Mbit/s of a camera with rfedge and with x264, {SIZE_DB:g} dB: {'; '.join(told)}."
+    told = [
+        f"{camera.ours_mbps:.2f} against {camera.x264_mbps:.2f} at {camera.name(', ')}"
+        for camera in told_cameras()
+    ]
+    return f"Mbit/s of a camera with rfedge and with x264, {BAR_DB:g} dB: {'; '.join(told)}."
 
 
 def _loadtest(named: Named) -> str:
@@ -379,4 +372,4 @@ FINDINGS: Mapping[str, Callable[[Named], str]] = {
     "slice-coder": _slice_coder,
     "tail": _tail,
 }
-"""By kind of result, what says the finding of its page."""
+"""Writers of a page's finding, by the kind of its result."""

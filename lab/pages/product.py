@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lab.bench import flattened
 from lab.pages.ladder import ladder_parts, write_ladder_figure
+from lab.pages.savings import span
+from lab.pages.sizing import told_cameras
+from lab.pages.summary import DRIVES, larger_sizes
 from lab.report import Draw, Report, bars
 from rfcore.errors import InvalidInput
 from rfedge.demo.report import METRIC, SUMMARY, figures_of
@@ -27,15 +29,10 @@ from rfedge.evaluate.lossy_link.measure import lossy_link_parts
 from rfedge.evaluate.never_worse.measure import NeverWorseRow, never_worse_parts
 from rfedge.report.tables import Column, Table, named_columns, text_table
 from rfedge.results import Result, rows_of
-from rfedge.sizing.estimate import Demand, estimate
-from rfedge.sizing.tables import shipped_tables
 
 # --- compare
 
-README_DRIVES = ("sample-empty", "sample-vehicles", "kitti-loop")
 README_LOSS = "sample-rain"
-README_SIZES = ((640, 360, 10.0), (1280, 720, 15.0), (1920, 1080, 30.0))
-SIZE = re.compile(r"\d+x\d+")
 README_FIGURE = "lab/results/figures/bd_rates.svg"
 SUMMARY_COLUMNS = (
     "drive",
@@ -56,7 +53,7 @@ def headline(compared: Result, harder: Result, sized: Result | None = None) -> s
     that lacks one of them.
     """
     rows, lossy = (of_first_window(rows_of(CompareRow, r["rows"])) for r in (compared, harder))
-    fair = [_against(rows, scene) for scene in README_DRIVES]
+    fair = [_against(rows, scene) for scene in DRIVES]
     *synthetic, real = (-row.bd_rate_percent for row in fair)
     rain = _against(lossy, README_LOSS).bd_rate_percent
     sentence = (
@@ -86,27 +83,19 @@ def _of_own_size(sized: Result | None) -> str:
     """Return what is saved on larger pictures, each size with the field that stands first."""
     if sized is None:
         return ""
-    rows = of_first_window(rows_of(CompareRow, sized["rows"]))
-    saved = defaultdict[str, dict[str, float]](dict)
-    for row in rows:
-        drive, _, size = row.scene.rpartition("-")
-        if SIZE.fullmatch(size) and (row.rival, _bare(row.method)) == (HEADLINE_ANCHOR, "rfedge"):
-            saved[size].setdefault(drive, -row.bd_rate_percent)
-    told = [
-        f"{min(drives.values()):.0f} to {max(drives.values()):.0f} % at {size}"
-        for size, drives in saved.items()
-    ]
+    saved = defaultdict[str, list[float]](list)
+    for drive in larger_sizes({"compare-size": sized}):
+        saved[drive.scene.rpartition("-")[2]].append(-drive.anchor.bd_rate_percent)
+    told = [f"{span(values)} at {size}" for size, values in saved.items()]
     return f"Larger pictures want a field trained on such: {', '.join(told)}. " if told else ""
 
 
 def _larger() -> str:
     """Return what ``rfedge size`` says of larger pictures and faster cameras."""
-    told = []
-    for width_px, height_px, hz in README_SIZES:
-        sizing = estimate(Demand(1, width_px, height_px, hz, 34.0), shipped_tables())
-        mbps = {row.codec: row.mbps for row in sizing.estimates}
-        saved_percent = 100 * (1 - mbps["rfedge"] / mbps["x264"])
-        told.append(f"{saved_percent:.0f} % at {width_px}x{height_px} and {hz:g} Hz")
+    told = [
+        f"{100 * (1 - camera.ours_mbps / camera.x264_mbps):.0f} % at {camera.name(' and ')}"
+        for camera in told_cameras()
+    ]
     return (
         "With the sample's, of 640x360 pictures, larger ones and faster cameras save less: "
         f"[`rfedge size`](docs/how-to/sizing.md) says {', '.join(told)}."

@@ -1,4 +1,4 @@
-"""What was saved on each recorded drive, beside x264 with our tools and the strongest rival.
+"""Savings on each recorded drive, beside x264 with our tools and the strongest rival.
 
 A saving is negative: bits of ours in percent more than the rival's. Bits and times are of rows of
 ``compare*.json``; a drive that was coded with several fields counts with the first.

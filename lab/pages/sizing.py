@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from lab.city.city import Density, VehicleKind, grid_city
 from lab.city.flow import costs_of
@@ -11,14 +12,39 @@ from lab.city.traffic import stated_traffic
 from lab.report import Report, bars
 from rfedge.report.tables import Column, Table
 from rfedge.results import Result, rows_of
-from rfedge.sizing.estimate import Demand
-from rfedge.sizing.tables import CODECS, SHIPPED, SizingCell, read_tables
+from rfedge.sizing.estimate import Demand, estimate
+from rfedge.sizing.tables import CODECS, SHIPPED, SizingCell, read_tables, shipped_tables
 
 PAGE_DB = (32.0, 34.0, 36.0)
 BAR_DB = 34.0
+TOLD = ((640, 360, 10.0), (1280, 720, 15.0), (1920, 1080, 30.0))
+"""Pictures and rates of which the README and the page's finding tell."""
 CITY_SERVERS = (10, 100, 1000)
 CITY_CORES = (2, 4)
 CITY_KIND = VehicleKind(Demand(1, 640, 360, 10.0, 34.0))
+
+
+@dataclass(frozen=True)
+class ToldCamera:
+    """A camera of ``TOLD``, and its Mbit/s by ``rfedge size`` at ``BAR_DB``."""
+
+    width_px: int
+    height_px: int
+    hz: float
+    ours_mbps: float
+    x264_mbps: float
+
+    def name(self, between: str) -> str:
+        """Return its size and rate."""
+        return f"{self.width_px}x{self.height_px}{between}{self.hz:g} Hz"
+
+
+def told_cameras() -> Iterator[ToldCamera]:
+    """Yield the cameras of ``TOLD`` by the tables that ship."""
+    for width_px, height_px, hz in TOLD:
+        told = estimate(Demand(1, width_px, height_px, hz, BAR_DB), shipped_tables())
+        mbps = {row.codec: row.mbps for row in told.estimates}
+        yield ToldCamera(width_px, height_px, hz, mbps["rfedge"], mbps["x264"])
 
 
 def _parts(result: Result) -> Iterator[Table | str]:

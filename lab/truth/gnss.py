@@ -53,7 +53,7 @@ COMMA_SEPARATION_M = -32.2
 
 @dataclass(frozen=True)
 class GnssCase:
-    """What a receiver says in each epoch, ``{clock}``, ``{day}`` and others replaced."""
+    """Sentences of a receiver in each epoch, ``{clock}``, ``{day}`` and others replaced."""
 
     name: str
     bodies: tuple[str, ...]

@@ -44,7 +44,7 @@ m=video {port} RTP/AVP 96
 a=rtpmap:96 H264/90000
 """
 NAME = ("the stream",) * (len(signature(rgb_from_video_frame).parameters) - 1)
-"""What revisions before 28 Nov 2026 do not take."""
+"""An argument that revisions before 28 Nov 2026 do not take."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _packets(coder: Coder, params: str) -> list[Any]:
 
 @dataclass(frozen=True)
 class Datagram:
-    """What is sent when: ``picture`` is the number of the access unit, ``port`` 1 for RTCP."""
+    """A packet and its time: ``picture`` is the number of the access unit, ``port`` 1 for RTCP."""
 
     due_s: float
     data: bytes

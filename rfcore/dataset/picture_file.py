@@ -194,12 +194,10 @@ class MaskFile:
         size_px = (picture.intrinsics.width_px, picture.intrinsics.height_px)
         for turned in (is_white, picture.orientation.shown(is_white)):
             height, width = turned.shape
-            if (width, height) == size_px or _is_scaled((width, height), size_px):
-                rows, columns = (
-                    (np.arange(count) * 2 + 1) * side // (2 * count)
-                    for count, side in ((size_px[1], height), (size_px[0], width))
-                )
-                return np.asarray(turned[rows[:, None], columns] != self.hides_white)
+            if (width, height) == size_px:
+                return np.asarray(turned != self.hides_white)
+            if _is_scaled((width, height), size_px):
+                return np.asarray(_nearest(turned, size_px) != self.hides_white)
         raise DatasetError(
             f"{self.path}: mask is {values.shape[1]}x{values.shape[0]} px, its picture "
             f"{size_px[0]}x{size_px[1]}; scale it to that size"
@@ -273,6 +271,15 @@ def picture_paths(folder: Path) -> list[Path]:
             f"{remedy(found, pattern)}"
         )
     return paths
+
+
+def _nearest(mask: Mask, size_px: tuple[int, int]) -> Mask:
+    """Return a mask of another size: of each pixel's middle, the pixel that holds it."""
+    rows, columns = (
+        (np.arange(count) * 2 + 1) * side // (2 * count)
+        for count, side in zip(size_px[::-1], mask.shape, strict=True)
+    )
+    return np.asarray(mask[rows[:, None], columns])
 
 
 def _is_scaled(size_px: tuple[int, int], from_px: tuple[int, int]) -> bool:

@@ -318,8 +318,8 @@ def _times_ns(
 def _cut(container: InputContainer, times_ns: tuple[int, ...]) -> str | None:
     """Return a line if the frames end long before the length that the file states."""
     stated_s = ((container.duration or 0) - max(container.start_time or 0, 0)) / 1e6
-    shown_s = times_ns[-1] / 1e9 * (1 + 1 / max(len(times_ns) - 1, 1))
-    period_s = shown_s / len(times_ns)
+    period_s = times_ns[-1] / 1e9 / max(len(times_ns) - 1, 1)
+    shown_s = times_ns[-1] / 1e9 + period_s
     if stated_s - shown_s <= max(LEAST_CUT_S, 2 * period_s):
         return None
     return f"frames end after {shown_s:.2f} s of the {stated_s:.2f} s stated: the file may be cut"

@@ -2,10 +2,10 @@
 
 from rfcore.field.interface import (
     Bounds,
-    CodecPictureRenderer,
     FieldMetadata,
     RadianceField,
     Renderer,
+    codec_renderer,
     render_field_view,
 )
 from rfcore.field.ngp import NgpField
@@ -18,7 +18,6 @@ from rfcore.field.store import FieldStore, load_field, save_field
 __all__ = [
     "FULL",
     "Bounds",
-    "CodecPictureRenderer",
     "FieldMetadata",
     "FieldStore",
     "NgpField",
@@ -26,6 +25,7 @@ __all__ = [
     "RadianceField",
     "Renderer",
     "SplatField",
+    "codec_renderer",
     "load_field",
     "read_splat_file",
     "render_field_view",

@@ -199,11 +199,19 @@ def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FUL
     >>> view.render.size_px
     (64, 36)
     """
-    # Of its class: a proxy that changes ``render`` and forwards the rest must not be passed by.
-    has_field_view = hasattr(type(renderer), "field_view")
-    if has_field_view and isinstance(renderer, CodecPictureRenderer):
-        return renderer.field_view(camera, quality)
+    quicker = codec_renderer(renderer)
+    if quicker is not None:
+        return quicker.field_view(camera, quality)
     return field_view_from_view(renderer.render(camera, quality), camera)
+
+
+def codec_renderer(renderer: Renderer) -> CodecPictureRenderer | None:
+    """Return the renderer if its class has a way of its own to the codec's picture.
+
+    A proxy that changes ``render`` and forwards the rest has none: it must not be passed by.
+    """
+    has_field_view = hasattr(type(renderer), "field_view")
+    return renderer if has_field_view and isinstance(renderer, CodecPictureRenderer) else None
 
 
 def base_of(archive: Archive) -> str | None:

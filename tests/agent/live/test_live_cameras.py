@@ -23,6 +23,7 @@ import pytest
 from cav_agent.live.reader import FrameRecord
 from cav_agent.live.settings import ReaderSettings, parse_address
 from cav_agent.live.source import ReaderProcess
+from lab.truth.stream import SDP
 from rfcore.image import read_rgb
 from rfcore.metrics import psnr
 from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
@@ -30,14 +31,6 @@ from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
 pytestmark = [pytest.mark.slow, pytest.mark.sample, pytest.mark.timeout(300)]
 
 FIELDS = Path("samples/fields")
-SDP = """v=0
-o=- 0 0 IN IP4 127.0.0.1
-s=camera
-c=IN IP4 127.0.0.1
-t=0 0
-m=video {port} RTP/AVP 96
-a=rtpmap:96 H264/90000
-"""
 
 
 @dataclass
