@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from typing import Any
 
 import grpc
@@ -76,11 +77,17 @@ async def test_a_connection_that_answers_nothing_any_more_is_given_up() -> None:
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
 
+    connections = list[asyncio.Task[Any] | None]()
+
     async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        connections.append(asyncio.current_task())
         far_reader, far_writer = await asyncio.open_connection("127.0.0.1", port)
         async with asyncio.TaskGroup() as both:
             both.create_task(forward(reader, far_writer, answers=False))
             both.create_task(forward(far_reader, writer, answers=True))
+        for end in (writer, far_writer):
+            with suppress(ConnectionError):
+                await end.wait_closed()
 
     proxy = await asyncio.start_server(connected, "127.0.0.1", 0)
     address = f"127.0.0.1:{proxy.sockets[0].getsockname()[1]}"
@@ -93,3 +100,5 @@ async def test_a_connection_that_answers_nothing_any_more_is_given_up() -> None:
             await asyncio.wait_for(call.read(), 15)
     proxy.close()
     await server.stop(None)
+    async with asyncio.timeout(15):
+        await asyncio.gather(*filter(None, connections))
